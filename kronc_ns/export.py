@@ -1,0 +1,190 @@
+"""Solutions to files: nerfstudio's transforms.json (only here), kronc.json, COLMAP models and PLY.
+
+An output folder is claimed with a marker file before anything is written and released with kronc.json as the
+last file, so that an interrupted run is never taken for a result and somebody else's folder is never touched.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+from torch import Tensor
+
+import kronc_ns
+from kronc_ns.errors import KroncError
+from kronc_ns.files import atomic_path, write_json
+from kronc_ns.geometry.camera import Camera
+from kronc_ns.geometry.poses import flip_camera_axes, invert
+from kronc_ns.keypoints.io import read_json
+from kronc_ns.scene import Scene, camera_and_frames, read_poses
+from kronc_ns.solve.solution import Solution, ViewStatus
+
+MARKER = ".kronc-incomplete"
+"""Present in an output folder from the first byte until kronc.json is written."""
+
+
+def claim_output(folder: Path) -> None:
+    """Make ``folder`` ours to write: new, empty, or holding an earlier (also an interrupted) result of kronc.
+
+    Raises `KroncError` where it holds anything else.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise KroncError(f"{folder} is a file: expected a folder for the output")
+    if folder.is_dir() and any(folder.iterdir()) and not ((folder / "kronc.json").exists() or (folder / MARKER).exists()):
+        raise KroncError(f"{folder} already holds data that kronc did not write: choose a new or empty folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / MARKER).touch()
+        (folder / "kronc.json").unlink(missing_ok=True)
+    except OSError as error:
+        raise KroncError(f"{folder} cannot be written: {error.strerror}") from None
+
+
+def release_output(folder: Path) -> None:
+    """The output is whole: take the marker away."""
+    (folder / MARKER).unlink(missing_ok=True)
+
+
+def transforms_dict(
+    camera: Camera,
+    names: Sequence[str],
+    c2w: Float[Tensor, "n 3 4"] | None,
+    masks: Sequence[str] | None = None,
+    depths: Sequence[str] | None = None,
+) -> dict[str, Any]:
+    """nerfstudio's transforms.json (OpenGL axes) as a dictionary; views with NaN poses are left out."""
+    content: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+        "k1": camera.k1,
+        "k2": camera.k2,
+        "p1": camera.p1,
+        "p2": camera.p2,
+    }
+    frames = []
+    opengl = None if c2w is None else flip_camera_axes(c2w.double())
+    for i, name in enumerate(names):
+        frame: dict[str, Any] = {"file_path": name}
+        if masks is not None:
+            frame["mask_path"] = masks[i]
+        if depths is not None:
+            frame["depth_file_path"] = depths[i]
+        if opengl is not None:
+            if not opengl[i].isfinite().all():
+                continue
+            frame["transform_matrix"] = [*opengl[i].tolist(), [0.0, 0.0, 0.0, 1.0]]
+        frames.append(frame)
+    content["frames"] = frames
+    return content
+
+
+def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, inputs: str) -> None:
+    """Write transforms.json, kronc.json and the keypoint cloud of a claimed ``folder``, and release it.
+
+    ``data`` is the folder that ``scene`` was read from (image paths are written relative to ``folder``);
+    ``inputs`` is the `fingerprint` of what was solved.
+    """
+    names = [_relative(data, name, folder) for name in solution.names]
+    masks = [_relative(data, mask, folder) for mask in scene.masks] if scene.masks else None
+    content = transforms_dict(solution.camera, names, solution.c2w, masks)
+    content["ply_file_path"] = "keypoints.ply"
+    known = solution.points[solution.points.isfinite().all(-1)]
+    with atomic_path(folder / "keypoints.ply") as path:
+        trimesh.PointCloud(known.numpy(), colors=np.tile([[200, 40, 40, 255]], (len(known), 1))).export(path)
+    write_json(folder / "transforms.json", content)
+    write_json(folder / "kronc.json", {**solution_dict(solution), "keypoint_schema": scene.schema.name, "inputs": inputs})
+    release_output(folder)
+
+
+def solution_dict(solution: Solution) -> dict[str, Any]:
+    """What kronc.json says about a solution; NaN becomes null."""
+    return {
+        "version": kronc_ns.__version__,
+        "status": solution.status.value,
+        "reason": solution.reason,
+        "solver": solution.solver,
+        "init": solution.init,
+        "iterations": solution.iterations,
+        "seconds": round(solution.seconds, 3),
+        "rmse_px": _number(solution.rmse_px),
+        "median_px": _number(solution.median_px),
+        "focal_px": [solution.camera.fx, solution.camera.fy],
+        "views": [
+            {**{"file_path" if k == "name" else k: v for k, v in asdict(view).items()}, "status": view.status.value}
+            for view in solution.views
+        ],
+        "points": [[_number(x) for x in point] for point in solution.points.tolist()],
+        "history": {key: list(values) for key, values in solution.history.items()},
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _relative(data: Path, name: str, folder: Path) -> str:
+    return Path(os.path.relpath((data / name).resolve(), folder.resolve())).as_posix()
+
+
+def write_colmap(folder: Path, solved: Path) -> int:
+    """Write the COLMAP model (binary) of a solved folder: camera, images with poses, keypoints as 3D points.
+
+    Returns the number of images. Positions, axes and the half-pixel convention are COLMAP's.
+    """
+    import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
+
+    import pycolmap
+
+    transforms = solved / "transforms.json"
+    camera, frames = camera_and_frames(read_json(transforms), transforms)
+    poses = read_poses(transforms)
+    report = read_json(solved / "kronc.json")
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            camera_id=1,
+            model="OPENCV",
+            width=camera.width,
+            height=camera.height,
+            params=[camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
+        )
+    )
+    for number, frame in enumerate(frames, start=1):
+        w2c = invert(poses[frame["file_path"]])
+        image = pycolmap.Image(name=Path(frame["file_path"]).name, camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(w2c.numpy()))
+    for point in report["points"]:
+        if None not in point:
+            model.add_point3D(np.array(point), pycolmap.Track(), np.array([200, 40, 40], dtype=np.uint8))
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(str(folder))
+    return len(frames)
+
+
+def write_ply(path: Path, solved: Path) -> int:
+    """Write camera centres (blue) and keypoints (red) of a solved folder as a point cloud; returns their number."""
+    poses = read_poses(solved / "transforms.json")
+    points = [point for point in read_json(solved / "kronc.json")["points"] if None not in point]
+    centres = torch.stack(list(poses.values()))[..., 3].numpy()
+    cloud = np.concatenate([centres, np.array(points).reshape(-1, 3)])
+    colours = np.array([[40, 80, 200, 255]] * len(centres) + [[200, 40, 40, 255]] * len(points), dtype=np.uint8)
+    with atomic_path(path) as temporary:
+        trimesh.PointCloud(cloud, colors=colours).export(temporary, file_type="ply")
+    return len(cloud)
+
+
+def solved_names(report: dict[str, Any]) -> set[str]:
+    """``file_path`` of the views of a kronc.json that have a pose."""
+    return {view["file_path"] for view in report["views"] if view["status"] != ViewStatus.FAILED.value}

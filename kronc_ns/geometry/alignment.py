@@ -1,0 +1,59 @@
+"""Similarity alignment of camera trajectories and the pose errors that remain after it."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from kronc_ns.geometry.poses import make_pose
+from kronc_ns.geometry.rotations import rotation_angle_deg
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale * rotation @ x + translation."""
+
+    scale: Tensor
+    rotation: Float[Tensor, "3 3"]
+    translation: Float[Tensor, "3"]
+
+    def apply(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Points carried into the target frame."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def apply_to_poses(self, c2w: Float[Tensor, "n 3 4"]) -> Float[Tensor, "n 3 4"]:
+        """Camera poses carried into the target frame; their rotations stay rotations."""
+        return make_pose(self.rotation @ c2w[..., :3], self.apply(c2w[..., 3]))
+
+
+def umeyama(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Similarity:
+    """Least-squares similarity with ``target ~ apply(source)`` (Umeyama, PAMI 1991, eq. 39-43).
+
+    Coincident source points carry no scale or rotation: the similarity is then a translation.
+    """
+    mean_source, mean_target = source.mean(0), target.mean(0)
+    centred_source, centred_target = source - mean_source, target - mean_target
+    variance = centred_source.square().sum() / len(source)
+    if variance <= torch.finfo(source.dtype).tiny:
+        identity = torch.eye(3, dtype=source.dtype, device=source.device)
+        return Similarity(torch.ones_like(variance), identity, mean_target - mean_source)
+    u, singular, vh = torch.linalg.svd(centred_target.T @ centred_source / len(source))
+    sign = torch.ones_like(singular)
+    sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))
+    rotation = (u * sign) @ vh
+    scale = (singular * sign).sum() / variance
+    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def pose_errors(
+    c2w: Float[Tensor, "n 3 4"], reference: Float[Tensor, "n 3 4"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Rotation error (degrees) and centre error (the reference's unit) of each view.
+
+    As in the paper (and BARF): the similarity that best maps the camera centres onto the reference's is
+    applied first, so neither the world frame nor the scale counts.
+    """
+    aligned = umeyama(c2w[..., 3], reference[..., 3]).apply_to_poses(c2w)
+    relative = aligned[..., :3].transpose(-1, -2) @ reference[..., :3]
+    return rotation_angle_deg(relative), (aligned[..., 3] - reference[..., 3]).norm(dim=-1)

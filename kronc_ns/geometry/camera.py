@@ -1,0 +1,92 @@
+"""The pinhole camera: intrinsics, projection and back-projection.
+
+Pixels: the centre of the top-left pixel is (0.5, 0.5), as in nerfstudio and COLMAP.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from kronc_ns.errors import KroncError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics shared by all views of a scene, in pixels (OpenCV distortion model)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not all(np.isfinite(values)):
+            raise KroncError(f"camera intrinsics {values} hold a value that is not finite: expected numbers in pixels")
+        if self.fx <= 0 or self.fy <= 0:
+            raise KroncError(
+                f"focal length ({self.fx:g}, {self.fy:g}) px is not positive: give the true one in pixels "
+                "as fl_x/fl_y in transforms.json or with --focal-length-px"
+            )
+        if self.width <= 0 or self.height <= 0:
+            raise KroncError(f"image size {self.width}x{self.height} is not positive: expected w and h in pixels")
+
+    @property
+    def distortion(self) -> tuple[float, float, float, float]:
+        """OpenCV's (k1, k2, p1, p2)."""
+        return (self.k1, self.k2, self.p1, self.p2)
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """The paper's K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def undistort(self, uv: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Pixels as an ideal pinhole camera with the same K would see them (CPU, float64)."""
+        if not any(self.distortion):
+            return uv
+        flat = uv.reshape(-1, 1, 2).double().cpu().numpy()
+        ideal = cv2.undistortPoints(flat, self.matrix, np.array(self.distortion), P=self.matrix)
+        return torch.from_numpy(ideal.reshape(uv.shape)).to(uv)
+
+    def scaled(self, factor: float) -> "Camera":
+        """The camera of the same image resized by ``factor``."""
+        return replace(
+            self,
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=self.cx * factor,
+            cy=self.cy * factor,
+            width=round(self.width * factor),
+            height=round(self.height * factor),
+        )
+
+
+def rays(uv: Float[Tensor, "*b 2"], camera: Camera) -> Float[Tensor, "*b 3"]:
+    """K^-1 (u, v, 1): camera-frame direction of each pixel with z = 1 (distortion is not considered)."""
+    x = (uv[..., 0] - camera.cx) / camera.fx
+    y = (uv[..., 1] - camera.cy) / camera.fy
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+
+def project(points_camera: Float[Tensor, "*b 3"], camera: Camera) -> Float[Tensor, "*b 2"]:
+    """Pixels of camera-frame points; meaningless where z <= 0, which the caller has to check."""
+    x, y, z = points_camera.unbind(-1)
+    return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
+
+
+def backproject(
+    uv: Float[Tensor, "n j 2"], depth: Float[Tensor, "n j"], c2w: Float[Tensor, "n 3 4"], camera: Camera
+) -> Float[Tensor, "n j 3"]:
+    """World points of pixels at z-depth ``depth``: the paper's equation 1."""
+    return (rays(uv, camera) * depth[..., None]) @ c2w[..., :3].transpose(-1, -2) + c2w[:, None, :, 3]

@@ -1,0 +1,64 @@
+"""Where the optimisation starts: camera poses and keypoint depths."""
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from kronc_ns.geometry.poses import compose, look_at, make_pose
+from kronc_ns.geometry.rotations import so3_exp
+
+Direction = Literal["ccw", "cw"]
+
+
+def circular_poses(
+    views: int, radius_m: float = 4.0, direction: Direction = "ccw", laps: float = 1.0
+) -> Float[Tensor, "n 3 4"]:
+    """The paper's coarse trajectory (section 5.2): a level circle about the z axis, all cameras facing it, no tilt.
+
+    View i stands at azimuth ``360 * laps * i / views`` degrees, counterclockwise seen from above by default.
+    OpenCV c2w, float64.
+    """
+    azimuth = torch.arange(views, dtype=torch.float64) * (2 * math.pi * laps / views)
+    if direction == "cw":
+        azimuth = -azimuth
+    centres = radius_m * torch.stack([azimuth.cos(), azimuth.sin(), torch.zeros_like(azimuth)], dim=1)
+    return look_at(centres, torch.zeros_like(centres), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+
+
+def noisy_poses(
+    c2w: Float[Tensor, "n 3 4"], rotation_deg: float, translation_m: float, generator: torch.Generator
+) -> Float[Tensor, "n 3 4"]:
+    """Known poses times noise from the right: cameras turn and move about themselves (paper, appendix B).
+
+    Each component of the rotation vector and of the translation is normal with the given standard deviation.
+    """
+    draw = torch.randn(len(c2w), 6, dtype=torch.float64, generator=generator).to(c2w)
+    noise = make_pose(so3_exp(draw[:, :3] * math.radians(rotation_deg)), draw[:, 3:] * translation_m)
+    return compose(c2w, noise)
+
+
+def mean_distance(c2w: Float[Tensor, "n 3 4"]) -> float:
+    """The paper's omega: mean L2 norm of the initial translations."""
+    return float(c2w[..., 3].norm(dim=-1).mean())
+
+
+def random_depths(c2w: Float[Tensor, "n 3 4"], keypoints: int, generator: torch.Generator) -> Float[Tensor, "n j"]:
+    """z-depths uniform in [omega / 2, omega] (paper, section 5.1)."""
+    uniform = torch.rand(len(c2w), keypoints, dtype=torch.float64, generator=generator).to(c2w)
+    return mean_distance(c2w) * (0.5 + 0.5 * uniform)
+
+
+def prior_depths(
+    given: Float[Tensor, "n j"], c2w: Float[Tensor, "n 3 4"], fallback: Float[Tensor, "n j"], metric: bool
+) -> Float[Tensor, "n j"]:
+    """Depths from depth maps, ``fallback`` where they have none (NaN).
+
+    Depths that are not metric (or whose trajectory is not) are scaled so that their median is 3/4 omega, the
+    middle of the paper's random range.
+    """
+    known = given.isfinite()
+    scale = 1.0 if metric or not known.any() else 0.75 * mean_distance(c2w) / float(given[known].median())
+    return torch.where(known, given * scale, fallback)

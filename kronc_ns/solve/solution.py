@@ -1,0 +1,80 @@
+"""What a solver hands on: poses with the evidence for them, never a bare array."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+from jaxtyping import Float
+from torch import Tensor
+
+from kronc_ns.geometry.camera import Camera
+
+
+class Status(str, Enum):
+    """How far a whole solution can be trusted; the value is the word in kronc.json."""
+
+    CONVERGED = "converged"
+    WEAK = "weak"
+    FAILED = "failed"
+
+
+class ViewStatus(str, Enum):
+    """How the pose of one view came about."""
+
+    SOLVED = "solved"
+    COMPLETED = "completed"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class ViewReport:
+    """Evidence for one view."""
+
+    name: str
+    status: ViewStatus
+    visible: int
+    """Keypoints found in the view."""
+    inliers: int
+    """Of those, how many the solved points explain."""
+    rmse_px: float | None
+    """Root mean square reprojection error of the inliers; None where the view was not solved."""
+    sigma_rot_deg: float | None = None
+    """Standard deviation of the rotation, where the solver estimates it."""
+    sigma_trans_m: float | None = None
+    """Standard deviation of the camera centre, where the solver estimates it."""
+    reason: str = ""
+    """Why the view is not solved."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Poses, points and the evidence for them, in a z-up world (OpenCV camera axes)."""
+
+    status: Status
+    reason: str
+    """One sentence on the status, with the remedy where it is not `Status.CONVERGED`."""
+    names: tuple[str, ...]
+    camera: Camera
+    c2w: Float[Tensor, "n 3 4"]
+    """Poses; NaN where a view failed."""
+    points: Float[Tensor, "j 3"]
+    """Keypoints in the world; NaN where fewer than two solved views see one."""
+    depths: Float[Tensor, "n j"]
+    """z-depth of each detection; NaN where there is none."""
+    views: Sequence[ViewReport]
+    initial_c2w: Float[Tensor, "n 3 4"]
+    """Where the optimisation started, in the frame of its initialiser."""
+    solver: str
+    init: str
+    iterations: int
+    seconds: float
+    rmse_px: float
+    """Root mean square reprojection error over all inliers."""
+    median_px: float
+    """Median reprojection error over all detections in solved views."""
+    history: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    @property
+    def solved(self) -> tuple[bool, ...]:
+        """Which views have a pose."""
+        return tuple(view.status is not ViewStatus.FAILED for view in self.views)

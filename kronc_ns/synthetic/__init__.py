@@ -1,0 +1,1 @@
+"""Synthetic car scenes with exact ground truth: keypoints only (fast) and rendered images."""
