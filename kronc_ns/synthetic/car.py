@@ -22,6 +22,7 @@ from kronc_ns.synthetic.car_parts import (
     plate_part,
     side_rail_height,
     surface_point,
+    tail_height,
     wheel_parts,
 )
 
@@ -133,9 +134,9 @@ def mip_levels(image: np.ndarray) -> tuple[np.ndarray, ...]:
     """The image [H,W,C] and its successive halvings, each the mean over 2 x 2 texels."""
     levels = [image]
     while min(levels[-1].shape[:2]) > 8:
-        height, width = (n // 2 for n in levels[-1].shape[:2])
-        blocks = levels[-1][: 2 * height, : 2 * width].reshape(height, 2, width, 2, -1)
-        levels.append(np.round(blocks.mean((1, 3), dtype=np.float32)).astype(np.uint8))
+        height, width = (n // 2 * 2 for n in levels[-1].shape[:2])
+        rows = levels[-1][:height:2, :width].astype(np.uint16) + levels[-1][1:height:2, :width]
+        levels.append(((rows[:, ::2] + rows[:, 1::2] + 2) // 4).astype(np.uint8))
     return tuple(levels)
 
 
@@ -160,7 +161,7 @@ def features(s: CarShape) -> dict[str, np.ndarray]:
     run over lower left and upper left to upper right; handles list front and rear end, wheels the centre and the
     bumper corner beside the arch.
     """
-    w, sill, tail, hood = s.width / 2, s.clearance + 0.10, s.boot_height - 0.09, s.nose_height
+    w, sill, tail, hood = s.width / 2, s.clearance + 0.10, tail_height(s), s.nose_height
     a_x, c_x, arch = s.cowl_x - 0.22, s.rear_axle_x + 0.06, s.rear_axle_x + s.arch_radius
     b_x = a_x - 0.55 * (a_x - arch) - 0.04
     x = np.linspace(s.cowl_x, s.rear_screen_foot_x + 0.12, 120)
@@ -190,7 +191,7 @@ def features(s: CarShape) -> dict[str, np.ndarray]:
         "rear_plate": _rectangle(0.26, tail - 0.13, tail - 0.02),
     }  # fmt: skip
     for name, (foot, head) in screens.items():
-        wide, narrow = (float(cabin_half_width(s, *np.array(point))) - 0.10 for point in (foot, head))
+        wide, narrow = (cabin_half_width(s, *np.array(point)[:, None])[0] - 0.10 for point in (foot, head))
         corners = [(-wide, foot[1]), (wide, foot[1]), (narrow, head[1]), (-narrow, head[1])]
         outlines[name] = _bent(corners, 0.045, w)
     return {name: np.array(points, dtype=float) for name, points in outlines.items()}
@@ -250,7 +251,7 @@ def _paint_side(s: CarShape, outlines: dict[str, np.ndarray], side: int) -> Laye
     c.fill(windows, GLASS, 1.0)
     for x in (door_a[4, 0] + 0.12, door_b[0, 0] + 0.28):
         seat = np.array([(0.02, -0.02), (-0.16, -0.02), (-0.22, 0.17), (-0.17, 0.28), (-0.09, 0.28), (-0.06, 0.17)])
-        c.fill(np.array([x, deck_height(s, np.array(x)) + 0.03]) + seat * (1, 0.85), INTERIOR, 1.0)
+        c.fill(np.array([x, deck_height(s, np.array([x]))[0] + 0.03]) + seat * (1, 0.85), INTERIOR, 1.0)
     b_foot, b_top = door_a[4], door_a[5]
     c.fill([b_foot + (0.045, 0.02), b_foot - (0.045, -0.02), b_top - (0.04, 0.02), b_top + (0.04, -0.02)], BLACK, 0.6)
     c.line([door_b[0] + (0.06, 0.02), door_b[0] + (0.02, 0.40)], BLACK, 0.03)
@@ -345,7 +346,7 @@ def _paint_screen(c: _Canvas, screen: np.ndarray) -> None:
 
 def _paint_rear(s: CarShape, outlines: dict[str, np.ndarray]) -> Layer:
     """Rear screen, tail lamps, boot lid seam, bumper with reflectors."""
-    w, tail = s.width / 2, s.boot_height - 0.09
+    w, tail = s.width / 2, tail_height(s)
     c = _Canvas((-1, 0, 0), (0, -1, 0), (0, 0, 1), (-w - 0.1, s.height + 0.05), (2 * w + 0.2, s.height + 0.05))
     screen, lamp, boot, corner = (outlines[f"rear_{name}"] for name in ("screen", "lamp", "boot", "bumper"))
     _paint_screen(c, screen)
@@ -358,7 +359,7 @@ def _paint_rear(s: CarShape, outlines: dict[str, np.ndarray]) -> Layer:
     c.line([(lamp[0, 0], tail), (lamp[0, 0] - 0.02, s.boot_height)], SEAM, 0.010)
     c.line([(-lamp[0, 0], tail), (-lamp[0, 0] + 0.02, s.boot_height)], SEAM, 0.010)
     c.fill(_rectangle(0.30, tail - 0.15, tail), PLASTIC)
-    c.disc((0, tail + 0.06), 0.042, SILVER, 0.8)
+    c.disc((0, tail - 0.205), 0.035, SILVER, 0.8)
     c.text("K66", (0.28 * w, tail - 0.26), 0.05, SILVER)
     c.both(lamp.mean(0) + (lamp - lamp.mean(0)) * 1.05, BLACK, 0.7)
     c.both(lamp, RED, 0.9)

@@ -143,8 +143,13 @@ def deck_height(s: CarShape, x: Float[np.ndarray, "..."]) -> np.ndarray:
     half = s.length / 2
     knots = [(half, s.nose_height - 0.06), (half - 0.16, s.nose_height), (s.cowl_x, s.cowl_height),
              (s.windscreen_top_x - 0.2, s.belt_height), (s.rear_screen_foot_x, s.boot_height),
-             (-half, s.boot_height - 0.25 * s.boot_length)]  # fmt: skip
+             (-half, s.boot_height - 0.2 * s.boot_length)]  # fmt: skip
     return _smooth_curve(x, knots, 0.12)
+
+
+def tail_height(s: CarShape) -> float:
+    """Upper edge of the tail lamps, below the rear edge of the deck."""
+    return float(deck_height(s, np.array([-s.length / 2]))[0]) - 0.07
 
 
 def roof_height(s: CarShape, x: Float[np.ndarray, "..."]) -> np.ndarray:
@@ -152,7 +157,7 @@ def roof_height(s: CarShape, x: Float[np.ndarray, "..."]) -> np.ndarray:
     peak = 0.55 * s.windscreen_top_x + 0.45 * s.rear_screen_top_x
     knots = [(s.cowl_x, s.cowl_height), (s.windscreen_top_x, s.height - 0.06), (peak, s.height + 0.004),
              (s.rear_screen_top_x, s.height - 0.07), (s.rear_screen_foot_x, s.boot_height)]  # fmt: skip
-    return _smooth_curve(x, knots, 0.28) + s.height - _smooth_curve(np.array(peak), knots, 0.28)
+    return _smooth_curve(x, knots, 0.28) + s.height - _smooth_curve(np.array([peak]), knots, 0.28)
 
 
 def _crowned_roof(s: CarShape, x: Float[np.ndarray, "..."], yn: Float[np.ndarray, "..."]) -> np.ndarray:
@@ -195,7 +200,7 @@ def body_field(s: CarShape, p: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "
     deck = (z - deck_height(s, x) + crown) * 0.97
     tub = _smooth_max(_smooth_max(_smooth_max(side, ends, 0.20), deck, 0.09), floor, 0.06)
     roof = (z - _crowned_roof(s, x, yn)) * 0.85
-    cabin = np.maximum(_smooth_max(_smooth_max(y - cabin_half_width(s, x, z), roof, 0.10), ends, 0.08), 0.5 - z)
+    cabin = np.maximum(_smooth_max(_smooth_max(y - cabin_half_width(s, x, z), roof, 0.10), ends + 0.12, 0.08), 0.5 - z)
     return -_smooth_max(-tub, -cabin, 0.09)
 
 
@@ -209,7 +214,7 @@ def surface_point(s: CarShape, view: Literal["side", "front", "rear"], u: float,
 def _first_outside(s: CarShape, start: Float[np.ndarray, "n 3"], step: Float[np.ndarray, "n 3"]) -> np.ndarray:
     """Fraction [n, 1] of `step` at which rays from inside cross the skin, by bisection."""
     low, high = np.zeros((len(start), 1)), np.ones((len(start), 1))
-    for _ in range(24):
+    for _ in range(18):
         middle = (low + high) / 2
         inside = body_field(s, start + middle * step)[:, None] < 0
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
@@ -293,7 +298,9 @@ def _cut(part: Part, value: Float[np.ndarray, "v"]) -> Part:
     q = p + len(faces)
     kept = [part.faces[count == 3], np.stack([a, p, q], 1)[lone_in],
             np.stack([p, b, c], 1)[~lone_in], np.stack([p, c, q], 1)[~lone_in]]  # fmt: skip
-    return Part(np.concatenate(new_v), np.concatenate(new_n), np.concatenate(kept), part.material)
+    normals = np.concatenate(new_n)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Part(np.concatenate(new_v), normals, np.concatenate(kept), part.material)
 
 
 def flat_part(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], material: str) -> Part:

@@ -256,9 +256,9 @@ def _ground_levels() -> tuple[np.ndarray, ...]:
     def stroke(a: tuple[float, float], b: tuple[float, float], rgb: tuple[int, int, int], width_m: float) -> None:
         cv2.line(image, pixel(*a), pixel(*b), rgb, max(1, round(width_m * scale)), cv2.LINE_AA)
 
-    for _ in range(160):
-        at, axes = tuple(rng.integers(0, size, 2).tolist()), tuple(rng.integers(3, 30, 2).tolist())
-        shade = int(rng.integers(70, 150))
+    for _ in range(120):
+        at, axes = tuple(rng.integers(0, size, 2).tolist()), tuple(rng.integers(3, 20, 2).tolist())
+        shade = int(rng.integers(84, 128))
         cv2.ellipse(image, at, axes, float(rng.uniform(0, 180)), 0, 360, (shade, shade, shade - 6), -1, cv2.LINE_AA)
     for _ in range(60):
         path = np.cumsum(np.vstack([rng.integers(0, size, (1, 2)), rng.integers(-30, 31, (14, 2))]), axis=0)

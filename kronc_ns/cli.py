@@ -1,0 +1,172 @@
+"""The `kronc` command."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from kronc_ns.config import SolverOptions
+from kronc_ns.console import exit_on_error, exit_status, progress_bar, solution_table
+from kronc_ns.errors import KroncError
+from kronc_ns.evaluate import evaluate_poses
+from kronc_ns.export import claim_output, write_colmap, write_ply, write_solution
+from kronc_ns.init import noisy_poses
+from kronc_ns.pipeline import fingerprint, solve_scene
+from kronc_ns.scene import load_scene, read_poses
+from kronc_ns.synthetic.folder import write_capture
+from kronc_ns.synthetic.scenes import default_camera, make_capture
+
+
+@dataclass(kw_only=True)
+class Solve(SolverOptions):
+    """Find the camera poses of a scene folder (transforms.json with intrinsics, keypoints.json)."""
+
+    data: Path
+    """Scene folder."""
+    output_dir: Path
+    """New or empty folder, or one with an earlier result; gets transforms.json, kronc.json and keypoints.ply."""
+    keypoints: Path | None = None
+    """Keypoints from elsewhere: our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON."""
+
+    def run(self) -> int:
+        """Solve and write."""
+        config = self.solver_config()
+        scene = load_scene(self.data, self.keypoints)
+        if self.output_dir.resolve() == self.data.resolve():
+            raise KroncError(f"--output-dir {self.output_dir} is the scene itself: choose another folder")
+        claim_output(self.output_dir)
+        with progress_bar("solving") as progress:
+            solution = solve_scene(scene, config, progress)
+        write_solution(self.output_dir, scene, solution, self.data, fingerprint(scene, config))
+        Console().print(solution_table(solution, scene.notes))
+        print(f"{self.output_dir / 'transforms.json'}")
+        return exit_status(solution)
+
+
+@dataclass(kw_only=True)
+class Eval:
+    """Compare poses with a reference after similarity alignment."""
+
+    poses: Path
+    """transforms.json with the poses to judge."""
+    reference: Path
+    """transforms.json (or reference.json) with the true or trusted poses."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Print the errors."""
+        errors = evaluate_poses(read_poses(self.poses), read_poses(self.reference)).as_dict()
+        if self.json:
+            print(json.dumps(errors))
+            return 0
+        table = Table("error", "mean", "median", "max", title=f"{errors['registered']} of {errors['views']} views")
+        for label, key in (("rotation (deg)", "rotation_deg"), ("camera centre (reference's unit)", "translation")):
+            table.add_row(label, *(f"{errors[key][which]:.4f}" for which in ("mean", "median", "max")))
+        Console().print(table)
+        print("  ".join(f"{key} {errors[key]:.4f}" for key in errors if key.startswith("auc")))
+        return 0
+
+
+@dataclass(kw_only=True)
+class Synth:
+    """Make a synthetic capture with exact ground truth: keypoints only, or rendered (--render)."""
+
+    output_dir: Path
+    """New or empty folder for the scene; the truth goes to reference.json."""
+    preset: Literal["carpatch", "walk"] = "walk"
+    """carpatch: cameras on a hemisphere, 400x400; walk: a handheld lap, 480x270."""
+    views: int = 100
+    """Number of images."""
+    width: int | None = None
+    """Image width in pixels (default: the preset's); the height follows."""
+    noise_px: float = 0.0
+    """Standard deviation of the keypoint noise per axis."""
+    outliers: float = 0.0
+    """Share of keypoints that lie anywhere on the car's box."""
+    missing: float = 0.0
+    """Share of visible keypoints that are not found."""
+    pose_noise_deg: float = 0.0
+    """Rotation noise of the poses written to transforms.json (with --pose-noise-m; 0 and 0: no poses)."""
+    pose_noise_m: float = 0.0
+    """Translation noise of the poses written to transforms.json."""
+    render: bool = False
+    """Draw images, masks and depth maps."""
+    seed: int = 0
+    """Seed of trajectory, detections and pose noise."""
+
+    def run(self) -> int:
+        """Make and write the capture."""
+        shares = {"--outliers": self.outliers, "--missing": self.missing}
+        for name, share in shares.items():
+            if not 0 <= share < 1:
+                raise KroncError(f"{name} is {share}: expected a share from 0 to below 1")
+        if self.views < 1 or (self.width is not None and self.width < 16):
+            raise KroncError(f"--views {self.views} --width {self.width}: expected at least 1 view of at least 16 pixels")
+        if min(self.noise_px, self.pose_noise_deg, self.pose_noise_m) < 0:
+            raise KroncError("--noise-px, --pose-noise-deg and --pose-noise-m must not be negative")
+        camera = default_camera(self.preset, self.width)
+        capture = make_capture(
+            self.preset, self.views, self.seed, self.noise_px, self.missing, self.outliers, camera
+        )
+        start = None
+        if self.pose_noise_deg or self.pose_noise_m:
+            generator = torch.Generator().manual_seed(self.seed)
+            start = noisy_poses(capture.c2w, self.pose_noise_deg, self.pose_noise_m, generator)
+        ground = self.preset == "walk"
+        with progress_bar("rendering" if self.render else "writing") as progress:
+            write_capture(
+                self.output_dir, capture, start, self.render, ground, lambda view: progress(view, self.views, None)
+            )
+        mean = float(capture.keypoints[..., 2].sum(1).mean())
+        print(f"{self.views} views, {mean:.1f} keypoints a view: {self.output_dir}")
+        return 0
+
+
+@dataclass(kw_only=True)
+class Export:
+    """Write solved poses in another format."""
+
+    data: Path
+    """Folder that `kronc solve` or `ns-process-data kronc` wrote."""
+    format: Literal["colmap", "ply"]
+    """colmap: binary COLMAP model in a folder; ply: camera centres and keypoints as a point cloud."""
+    output: Path | None = None
+    """Where to (default: DATA/colmap/sparse/0, or DATA/cameras.ply); must not exist."""
+
+    def run(self) -> int:
+        """Export."""
+        if not (self.data / "kronc.json").exists():
+            raise KroncError(f"{self.data / 'kronc.json'} does not exist: expected a folder solved by `kronc solve`")
+        default = self.data / ("colmap/sparse/0" if self.format == "colmap" else "cameras.ply")
+        output = self.output or default
+        if output.is_file() or (output.is_dir() and any(output.iterdir())):
+            raise KroncError(f"{output} exists already: give another --output")
+        write = write_colmap if self.format == "colmap" else write_ply
+        count = write(output, self.data)
+        print(f"{count} {'images' if self.format == 'colmap' else 'points'}: {output}")
+        return 0
+
+
+Command = (
+    Annotated[Solve, tyro.conf.subcommand("solve")]
+    | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Synth, tyro.conf.subcommand("synth")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+)
+
+
+def main() -> None:
+    """Entry point of `kronc`."""
+    command = tyro.cli(Command, prog="kronc", description="Camera poses of a walk around a car from semantic keypoints.")
+    with exit_on_error():
+        raise SystemExit(command.run())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""What the commands share on a terminal: progress, the table of a solution, errors and exit statuses."""
+
+import errno
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from kronc_ns.errors import KroncError
+from kronc_ns.solve.solution import Solution, Status, ViewStatus
+
+_LISTED = 8  # failed views named in the table
+
+
+@contextmanager
+def exit_on_error() -> Iterator[None]:
+    """Turn errors a user can cause into one line on stderr and exit status 2; Ctrl-C into 130."""
+    try:
+        yield
+    except KroncError as error:
+        sys.exit(_fail(str(error), 2))
+    except KeyboardInterrupt:
+        sys.exit(_fail("interrupted; the same command starts again", 130))
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT):
+            sys.exit(_fail(f"{error.filename or 'output'} cannot be written: {error.strerror}", 2))
+        raise
+
+
+def exit_status(solution: Solution) -> int:
+    """0 for a trustworthy solution, else 3 with the reason on stderr."""
+    return 0 if solution.status is Status.CONVERGED else _fail(f"{solution.status.value}: {solution.reason}", 3)
+
+
+def _fail(message: str, status: int) -> int:
+    print(("error: " if status == 2 else "") + " ".join(message.split()), file=sys.stderr)
+    return status
+
+
+@contextmanager
+def progress_bar(description: str) -> Iterator[Callable[[int, int, float | None], None]]:
+    """A bar on stderr with time left; the callback takes (step, steps, loss or None)."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}{task.fields[loss]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(description, total=None, loss="", visible=False)
+
+        def advance(step: int, steps: int, loss: float | None) -> None:
+            shown = "" if loss is None else f"  loss {loss:.4g}"
+            bar.update(task, completed=step, total=steps, loss=shown, visible=True)
+
+        yield advance
+
+
+def solution_table(solution: Solution, notes: tuple[str, ...] = ()) -> Table:
+    """Summary of a solution: views solved and failed (with reasons), residuals, time."""
+    solved = sum(view.status is ViewStatus.SOLVED for view in solution.views)
+    failed = [view for view in solution.views if view.status is ViewStatus.FAILED]
+    rate = solution.iterations / solution.seconds if solution.seconds else 0.0
+    table = Table(title=f"KRONC: {solution.status.value}", title_justify="left", show_header=False)
+    table.add_row("views solved", f"{solved} of {len(solution.views)}")
+    for view in failed[:_LISTED]:
+        table.add_row("  left out", f"{view.name}: {view.reason}")
+    if len(failed) > _LISTED:
+        table.add_row("  left out", f"... and {len(failed) - _LISTED} more (kronc.json lists all)")
+    table.add_row("reprojection", f"RMSE {solution.rmse_px:.2f} px of the inliers, median {solution.median_px:.2f} px of all")
+    table.add_row("solver", f"{solution.solver} from {solution.init} poses, {solution.iterations} steps")
+    table.add_row("time", f"{solution.seconds:.2f} s ({rate:.0f} steps/s)")
+    for note in notes:
+        table.add_row("note", note)
+    return table
