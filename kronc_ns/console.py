@@ -1,15 +1,18 @@
 """What the commands share on a terminal: progress, the table of a solution, errors and exit statuses."""
 
 import errno
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from kronc_ns.errors import KroncError
+from kronc_ns.export import solution_dict
 from kronc_ns.solve.solution import Solution, Status, ViewStatus
 
 _LISTED = 8  # failed views named in the table
@@ -60,20 +63,28 @@ def progress_bar(description: str) -> Iterator[Callable[[int, int, float | None]
         yield advance
 
 
-def solution_table(solution: Solution, notes: tuple[str, ...] = ()) -> Table:
-    """Summary of a solution: views solved and failed (with reasons), residuals, time."""
-    solved = sum(view.status is ViewStatus.SOLVED for view in solution.views)
-    failed = [view for view in solution.views if view.status is ViewStatus.FAILED]
-    rate = solution.iterations / solution.seconds if solution.seconds else 0.0
-    table = Table(title=f"KRONC: {solution.status.value}", title_justify="left", show_header=False)
-    table.add_row("views solved", f"{solved} of {len(solution.views)}")
+def report_table(report: dict[str, Any]) -> Table:
+    """Summary of a solution from its kronc.json content: views solved and failed (with reasons), residuals, time."""
+    views = report["views"]
+    solved = sum(view["status"] == ViewStatus.SOLVED.value for view in views)
+    failed = [view for view in views if view["status"] == ViewStatus.FAILED.value]
+    rate = report["iterations"] / report["seconds"] if report["seconds"] else 0.0
+    table = Table(title=f"KRONC: {report['status']}", title_justify="left", show_header=False)
+    table.add_row("views solved", f"{solved} of {len(views)}")
     for view in failed[:_LISTED]:
-        table.add_row("  left out", f"{view.name}: {view.reason}")
+        table.add_row("  left out", f"{view['file_path']}: {view['reason']}")
     if len(failed) > _LISTED:
         table.add_row("  left out", f"... and {len(failed) - _LISTED} more (kronc.json lists all)")
-    table.add_row("reprojection", f"RMSE {solution.rmse_px:.2f} px of the inliers, median {solution.median_px:.2f} px of all")
-    table.add_row("solver", f"{solution.solver} from {solution.init} poses, {solution.iterations} steps")
-    table.add_row("time", f"{solution.seconds:.2f} s ({rate:.0f} steps/s)")
+    rmse, median = (math.nan if report[key] is None else report[key] for key in ("rmse_px", "median_px"))
+    table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {median:.2f} px of all")
+    table.add_row("solver", f"{report['solver']} from {report['init']} poses, {report['iterations']} steps")
+    table.add_row("time", f"{report['seconds']:.2f} s ({rate:.0f} steps/s)")
+    return table
+
+
+def solution_table(solution: Solution, notes: tuple[str, ...] = ()) -> Table:
+    """`report_table` of a solution, with what loading the scene decided."""
+    table = report_table(solution_dict(solution))
     for note in notes:
         table.add_row("note", note)
     return table

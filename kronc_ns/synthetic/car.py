@@ -1,17 +1,20 @@
 """A procedural car of our own: where its features lie, how they are painted, and its 66 keypoints.
 
-A feature (lamp, window, door, plate) is a polygon in one of four orthographic views. The same polygon is painted on the
-view's texture and, cast onto the mesh along the view direction, gives the keypoints: a point always sits on what is drawn.
+A feature (lamp, window, door, plate) is a polygon in one of four orthographic views. The same polygon is painted on
+the view's texture and, cast onto the mesh along the view direction, gives the keypoints: a point always sits on what
+is drawn.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import trimesh
 
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.synthetic.car_parts import (
     CarShape,
     Part,
@@ -28,6 +31,7 @@ from kronc_ns.synthetic.car_parts import (
 
 METRES_PER_TEXEL = 0.0025
 Rgb = tuple[int, int, int]
+Outline = np.ndarray | list
 BLACK, SEAM, RUBBER, PLASTIC = (12, 12, 14), (16, 16, 20), (30, 30, 32), (44, 45, 48)
 GLASS, INTERIOR, SILVER, WHITE = (26, 33, 40), (52, 54, 58), (190, 194, 200), (235, 236, 232)
 RED, DARK_RED, AMBER = (190, 22, 26), (120, 12, 18), (228, 132, 30)
@@ -91,23 +95,23 @@ class _Canvas:
         self.corner = corner
         self.flip = np.array([self.right.sum(), self.up.sum()])
 
-    def _pixels(self, points: np.ndarray) -> np.ndarray:
+    def _pixels(self, points: Outline) -> np.ndarray:
         """Fixed-point pixel coordinates (4 fractional bits) of points given as (x or y, z or y) in metres."""
         pixel = (np.asarray(points, float) * self.flip - self.corner) * (1, -1) / METRES_PER_TEXEL - 0.5
         return np.round(pixel * 16).astype(np.int32)
 
-    def fill(self, polygon: np.ndarray, rgb: Rgb, gloss: float = 0.3) -> None:
+    def fill(self, polygon: Outline, rgb: Rgb, gloss: float = 0.3) -> None:
         """A filled polygon."""
         points = [self._pixels(polygon)]
         cv2.fillPoly(self.rgb, points, rgb, cv2.LINE_AA, 4)
         cv2.fillPoly(self.rest, points, (255, round(255 * gloss)), cv2.LINE_AA, 4)
 
-    def both(self, polygon: np.ndarray, rgb: Rgb, gloss: float = 0.3) -> None:
+    def both(self, polygon: Outline, rgb: Rgb, gloss: float = 0.3) -> None:
         """A filled polygon and its mirror image across the first coordinate."""
         self.fill(polygon, rgb, gloss)
         self.fill(np.asarray(polygon) * (-1, 1), rgb, gloss)
 
-    def line(self, points: np.ndarray, rgb: Rgb, width: float, closed: bool = False) -> None:
+    def line(self, points: Outline, rgb: Rgb, width: float, closed: bool = False) -> None:
         """A polyline of a width in metres."""
         pixels, thick = [self._pixels(points)], max(1, round(width / METRES_PER_TEXEL))
         cv2.polylines(self.rgb, pixels, closed, rgb, thick, cv2.LINE_AA, 4)
@@ -115,7 +119,7 @@ class _Canvas:
 
     def disc(self, centre: tuple[float, float], radius: float, rgb: Rgb, gloss: float = 0.3) -> None:
         """A filled circle."""
-        self.fill(_arc(centre, radius, 0, 360), rgb, gloss)
+        self.fill(_arc(centre, radius, 0.0, 360.0), rgb, gloss)
 
     def text(self, text: str, left_foot: tuple[float, float], height: float, rgb: Rgb) -> None:
         """Text that reads correctly from outside; `left_foot` is the reader's lower left corner."""
@@ -149,7 +153,7 @@ def _arc(centre: tuple[float, float], radius: float, start_deg: float, stop_deg:
 def _bent(points: list[tuple[float, float]], sag: float, half_width: float) -> np.ndarray:
     """Edges of a symmetric polygon subdivided and lowered by sag (y / half_width)^2, as crowned panels are."""
     ring = np.array([*points, points[0]], dtype=float)
-    dense = np.concatenate([np.linspace(a, b, 12, endpoint=False) for a, b in zip(ring[:-1], ring[1:], strict=True)])
+    dense = np.concatenate([np.linspace(a, b, 12, endpoint=False) for a, b in pairwise(ring)])
     dense[:, 1] -= sag * (dense[:, 0] / half_width) ** 2
     return dense
 
@@ -162,12 +166,16 @@ def features(s: CarShape) -> dict[str, np.ndarray]:
     bumper corner beside the arch.
     """
     w, sill, tail, hood = s.width / 2, s.clearance + 0.10, tail_height(s), s.nose_height
-    a_x, c_x, arch = s.cowl_x - 0.22, s.rear_axle_x + 0.06, s.rear_axle_x + s.arch_radius
+    a_x = min(s.cowl_x - 0.22, s.front_axle_x - s.arch_radius - 0.06)
+    c_x, arch = s.rear_axle_x + 0.06, s.rear_axle_x + s.arch_radius
+    r, front_arch, rear_arch = s.wheel_radius, s.front_axle_x + s.arch_radius, s.rear_axle_x - s.arch_radius
     b_x = a_x - 0.55 * (a_x - arch) - 0.04
     x = np.linspace(s.cowl_x, s.rear_screen_foot_x + 0.12, 120)
     window_top = side_rail_height(s, x) - 0.105
     sash = deck_height(s, x) + 0.012
     x, window_top, sash = (v[window_top > sash + 0.03] for v in (x, window_top, sash))
+    if len(x) == 0:
+        raise ValueError(f"no room for side windows: height {s.height} m over belt_height {s.belt_height} m")
     belt_a, belt_b, belt_c = deck_height(s, np.array([a_x, b_x, c_x])) - 0.012
     b_top = (b_x - 0.05, np.interp(0.05 - b_x, -x, window_top) + 0.02)
     screens = {"front_screen": ((s.cowl_x - 0.15, s.cowl_height + 0.03), (s.windscreen_top_x, s.height - 0.085)),
@@ -176,13 +184,14 @@ def features(s: CarShape) -> dict[str, np.ndarray]:
     outlines = {
         "side_windows": np.concatenate([np.stack([x, window_top], 1), np.stack([x, sash], 1)[::-1]]),
         "side_front_door": [(a_x, belt_a), (a_x + 0.03, sill + 0.28), (a_x, sill), (b_x, sill), (b_x, belt_b), b_top],
-        "side_rear_door": [(c_x - 0.12, belt_c), (c_x - 0.02, 0.80 * belt_c), (arch - 0.02, s.wheel_radius + 0.33),
-                           (arch + 0.07, s.wheel_radius + 0.10), (arch + 0.09, sill), (b_x, sill), (b_x, belt_b), b_top],
+        "side_rear_door": [(c_x - 0.12, belt_c), (c_x - 0.02, 0.80 * belt_c), (arch - 0.02, r + 0.33),
+                           (arch + 0.07, r + 0.10), (arch + 0.09, sill), (b_x, sill), (b_x, belt_b), b_top],
         "side_front_handle": [(b_x + 0.24, belt_b - 0.13), (b_x + 0.06, belt_b - 0.13)],
         "side_rear_handle": [(c_x + 0.20, belt_c - 0.13), (c_x + 0.02, belt_c - 0.13)],
-        "side_front_wheel": [(s.front_axle_x, s.wheel_radius), (s.front_axle_x + s.arch_radius + 0.02, s.clearance + 0.09)],
-        "side_rear_wheel": [(s.rear_axle_x, s.wheel_radius), (s.rear_axle_x - s.arch_radius - 0.02, s.clearance + 0.10)],
-        "front_lamp": [(0.50 * w, hood - 0.095), (0.52 * w, hood - 0.20), (0.85 * w, hood - 0.17), (0.83 * w, hood - 0.065)],
+        "side_front_wheel": [(s.front_axle_x, r), (front_arch + 0.02, s.clearance + 0.09)],
+        "side_rear_wheel": [(s.rear_axle_x, r), (rear_arch - 0.02, s.clearance + 0.10)],
+        "front_lamp": [(0.50 * w, hood - 0.095), (0.52 * w, hood - 0.20), (0.85 * w, hood - 0.17),
+                       (0.83 * w, hood - 0.065)],
         "front_fog": [(0.58 * w, 0.455), (0.60 * w, 0.36), (0.80 * w, 0.37), (0.81 * w, 0.45)],
         "front_plate": _rectangle(0.26, 0.405, 0.515),
         "rear_lamp": [(0.50 * w, tail), (0.53 * w, tail - 0.15), (0.83 * w, tail - 0.165), (0.80 * w, tail + 0.005)],
@@ -214,7 +223,7 @@ KEYPOINTS: dict[int, tuple[str, int]] = {
 }  # fmt: skip
 """Keypoints of the left half: index -> (feature, vertex of its outline)."""
 
-MIRROR = np.concatenate([57 - np.arange(58), [59, 58, 61, 60, 63, 62, 65, 64]])
+MIRROR = np.array(APOLLOCAR3D_66.flip)
 """Mirror partner of each keypoint."""
 
 
@@ -228,6 +237,9 @@ def _keypoints(mesh: trimesh.Trimesh, outlines: dict[str, np.ndarray]) -> np.nda
                      np.stack([np.where(views == "front", 5.0, -5.0), at[:, 0], at[:, 1]], 1))  # fmt: skip
     direction = np.where(side[:, None], [0.0, -1, 0], -np.sign(start[:, :1]) * [1.0, 0, 0])
     located, ray, _ = mesh.ray.intersects_location(start, direction, multiple_hits=False)
+    missed = [KEYPOINTS[i] for i in np.delete(index, ray)]
+    if missed:
+        raise ValueError(f"features {missed} lie outside the body: expected dimensions of a plausible car")
     points = np.empty((len(MIRROR), 3))
     points[index[ray]] = located
     points[MIRROR[index[ray]]] = located * (1, -1, 1)
@@ -252,17 +264,17 @@ def _paint_side(s: CarShape, outlines: dict[str, np.ndarray], side: int) -> Laye
     for x in (door_a[4, 0] + 0.12, door_b[0, 0] + 0.28):
         seat = np.array([(0.02, -0.02), (-0.16, -0.02), (-0.22, 0.17), (-0.17, 0.28), (-0.09, 0.28), (-0.06, 0.17)])
         c.fill(np.array([x, deck_height(s, np.array([x]))[0] + 0.03]) + seat * (1, 0.85), INTERIOR, 1.0)
-    b_foot, b_top = door_a[4], door_a[5]
-    c.fill([b_foot + (0.045, 0.02), b_foot - (0.045, -0.02), b_top - (0.04, 0.02), b_top + (0.04, -0.02)], BLACK, 0.6)
-    c.line([door_b[0] + (0.06, 0.02), door_b[0] + (0.02, 0.40)], BLACK, 0.03)
+    pillar = np.array([(0.045, 0.02), (-0.045, 0.02), (-0.04, -0.02), (0.04, -0.02)])
+    c.fill(door_a[[4, 4, 5, 5]] + pillar, BLACK, 0.6)
+    c.line(door_b[[0, 0]] + np.array([(0.06, 0.02), (0.02, 0.40)]), BLACK, 0.03)
     for door in (door_a, door_b):
         c.line(door[:5] if door is door_a else door[:7], SEAM, 0.012)
     sash = windows[len(windows) // 2 :]
     c.line(sash - (0, 0.006), SILVER, 0.012)
     strip = np.array([(front - s.arch_radius - 0.05, r + 0.14), (rear + s.arch_radius + 0.1, r + 0.14)])
     c.line(strip, PLASTIC, 0.035)
-    c.line(strip + (0, 0.012), SILVER, 0.008)
-    c.fill(_arc((front - 0.06, s.nose_height + 0.06), 0.022, 0, 360) * (1, 1), AMBER, 0.6)
+    c.line(strip + np.array([0, 0.012]), SILVER, 0.008)
+    c.fill(_arc((front - 0.06, s.nose_height + 0.06), 0.022, 0.0, 360.0), AMBER, 0.6)
     for name, x in (("front", s.length / 2 - 0.26), ("rear", -s.length / 2 + 0.24)):
         arch_x = front + s.arch_radius if name == "front" else rear - s.arch_radius
         c.line([(x, 0.60 * s.belt_height), (arch_x, 0.60 * s.belt_height)], SEAM, 0.010)
@@ -285,7 +297,7 @@ def _paint_wheel(c: _Canvas, centre: tuple[float, float], radius: float) -> None
     """Tyre side wall with lettering, alloy rim with five double spokes, hub."""
     rim = 0.70 * radius
     c.disc(centre, radius, RUBBER, 0.1)
-    for start in (20, 200):
+    for start in (20.0, 200.0):
         c.line(_arc(centre, 0.86 * radius, start, start + 40), (120, 120, 120), 0.014)
     c.disc(centre, rim + 0.004, SILVER, 0.6)
     c.disc(centre, rim - 0.022, BLACK, 0.2)
@@ -295,7 +307,8 @@ def _paint_wheel(c: _Canvas, centre: tuple[float, float], radius: float) -> None
             a = np.radians(90 + 72 * k + offset)
             along, across = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
             foot, tip = np.array(centre) + 0.03 * along, np.array(centre) + (rim - 0.01) * along
-            c.fill([foot + 0.022 * across, foot - 0.022 * across, tip - 0.015 * across, tip + 0.015 * across], SILVER, 0.6)
+            spoke = [foot + 0.022 * across, foot - 0.022 * across, tip - 0.015 * across, tip + 0.015 * across]
+            c.fill(np.array(spoke), SILVER, 0.6)
     c.disc(centre, 0.065, SILVER, 0.6)
     c.disc(centre, 0.030, PLASTIC, 0.6)
 
@@ -309,11 +322,11 @@ def _paint_front(s: CarShape, outlines: dict[str, np.ndarray]) -> Layer:
     low, wide = screen[:, 1].min(), screen[12, 0]
     for y in (-0.05, 0.55 * wide):
         c.line([(y, low + 0.03), (y + 0.50 * wide, low + 0.10)], BLACK, 0.020)
-    c.fill([(-0.42 * w, hood - 0.20), (0.42 * w, hood - 0.20), (0.46 * w, hood - 0.11), (-0.46 * w, hood - 0.11)], BLACK)
+    c.fill([(-0.42 * w, hood - 0.2), (0.42 * w, hood - 0.2), (0.46 * w, hood - 0.11), (-0.46 * w, hood - 0.11)], BLACK)
     for z in (hood - 0.175, hood - 0.14):
         c.line([(-0.43 * w, z), (0.43 * w, z)], SILVER, 0.010)
-    c.disc((0, hood - 0.155), 0.055, SILVER, 0.8)
-    c.disc((0, hood - 0.155), 0.040, (20, 40, 90), 0.8)
+    c.disc((0.0, hood - 0.155), 0.055, SILVER, 0.8)
+    c.disc((0.0, hood - 0.155), 0.040, (20, 40, 90), 0.8)
     c.fill([(-0.50 * w, 0.24), (0.50 * w, 0.24), (0.44 * w, 0.375), (-0.44 * w, 0.375)], BLACK)
     for y in np.linspace(-0.44, 0.44, 15) * w:
         c.line([(y, 0.25), (y, 0.365)], (70, 71, 75), 0.010)
@@ -359,7 +372,7 @@ def _paint_rear(s: CarShape, outlines: dict[str, np.ndarray]) -> Layer:
     c.line([(lamp[0, 0], tail), (lamp[0, 0] - 0.02, s.boot_height)], SEAM, 0.010)
     c.line([(-lamp[0, 0], tail), (-lamp[0, 0] + 0.02, s.boot_height)], SEAM, 0.010)
     c.fill(_rectangle(0.30, tail - 0.15, tail), PLASTIC)
-    c.disc((0, tail - 0.205), 0.035, SILVER, 0.8)
+    c.disc((0.0, tail - 0.205), 0.035, SILVER, 0.8)
     c.text("K66", (0.28 * w, tail - 0.26), 0.05, SILVER)
     c.both(lamp.mean(0) + (lamp - lamp.mean(0)) * 1.05, BLACK, 0.7)
     c.both(lamp, RED, 0.9)
@@ -368,10 +381,10 @@ def _paint_rear(s: CarShape, outlines: dict[str, np.ndarray]) -> Layer:
     c.both(band.mean(0) + (band - band.mean(0)) * (0.8, 0.5), (232, 228, 224), 0.9)
     c.fill([(-0.62 * w, 0.22), (0.62 * w, 0.22), (0.56 * w, 0.33), (-0.56 * w, 0.33)], PLASTIC)
     c.line([(-0.75 * w, 0.40), (0.75 * w, 0.40)], SEAM, 0.012)
+    reflector = np.array([(0, 0), (0.20, 0), (0.20, 0.045), (0.01, 0.045)])
     for sign in (-1, 1):
         c.line([(sign * 0.56 * w, z), (sign * 0.92 * w, 0.58)], SEAM, 0.010)
-        c.fill(np.array([corner[0], corner[0] - (0.20, 0), corner[0] - (0.20, 0.045), corner[0] - (0.01, 0.045)]) * (sign, 1),
-               DARK_RED, 0.8)  # fmt: skip
+        c.fill((corner - reflector) * (sign, 1), DARK_RED, 0.8)
         c.disc((sign * 0.42 * w, 0.24), 0.035, SILVER, 0.8)
     return c.layer(0.12)
 
@@ -382,14 +395,15 @@ def _paint_top(s: CarShape) -> Layer:
     c = _Canvas((0, 0, 1), (0, -1, 0), (1, 0, 0), (-w - 0.1, half), (2 * w + 0.2, 2 * half))
     nose, cowl = s.length / 2, s.cowl_x
     for sign in (-1, 1):
-        c.line([(sign * 0.50 * w, nose - 0.13), (sign * 0.74 * w, nose - 0.42), (sign * 0.80 * w, cowl - 0.16)], SEAM, 0.012)
+        seam = np.array([(0.50 * w, nose - 0.13), (0.74 * w, nose - 0.42), (0.80 * w, cowl - 0.16)])
+        c.line(seam * (sign, 1), SEAM, 0.012)
         c.line([(sign * 0.25 * w, nose - 0.25), (sign * 0.42 * w, cowl - 0.10)], (20, 24, 30), 0.006)
         c.disc((sign * 0.30 * w, cowl - 0.02), 0.018, BLACK)
         rail = np.array([(sign * 0.60 * w, s.windscreen_top_x - 0.15), (sign * 0.58 * w, s.rear_screen_top_x + 0.12)])
         c.line(rail, PLASTIC, 0.035)
     roof = np.array([s.windscreen_top_x - 0.22, 0.55 * s.windscreen_top_x + 0.45 * s.rear_screen_top_x])
-    c.fill(_rounded(0, roof.mean(), 0.40 * w, np.ptp(roof) / 2), GLASS, 1.0)
-    c.disc((0, s.rear_screen_top_x + 0.14), 0.035, BLACK)
+    c.fill(_rounded(0.0, roof.mean(), 0.40 * w, np.ptp(roof) / 2), GLASS, 1.0)
+    c.disc((0.0, s.rear_screen_top_x + 0.14), 0.035, BLACK)
     return c.layer(0.72)
 
 
@@ -423,16 +437,17 @@ def build_car(shape: CarShape = CarShape(), paint_rgb: Rgb = (36, 92, 168)) -> C
     parts = left + [part.mirrored() for part in left]
     for view, facing in (("front", 1), ("rear", -1)):
         plate = outlines[f"{view}_plate"]
-        middle = float(plate[:, 1].mean())
-        deepest = max(abs(surface_point(shape, view, 0.0, z)[0]) for z in plate[:, 1])
-        parts.append(plate_part(np.array([facing * (deepest - 0.012), 0, middle]), 0.263, np.ptp(plate[:, 1]) / 2 + 0.003))
+        outermost = max(abs(surface_point(shape, view, 0.0, z)[0]) for z in plate[:, 1])
+        centre = np.array([facing * (outermost - 0.012), 0, plate[:, 1].mean()])
+        parts.append(plate_part(centre, 0.263, np.ptp(plate[:, 1]) / 2 + 0.003))
     body_layers = ("left", "right", "front", "rear", "top", "under")
     materials = {"body": Material(paint_rgb, 0.55, body_layers), "wheel": Material(SILVER, 0.5, ("left", "right")),
                  "tyre": Material(RUBBER, 0.05, ("left", "right")), "dark": Material(BLACK, 0.0),
                  "paint": Material(paint_rgb, 0.55), "trim": Material(PLASTIC, 0.3),
                  "plate": Material(BLACK, 0.2, ("front_plate", "rear_plate"))}  # fmt: skip
     layers = {"left": _paint_side(shape, outlines, 1), "right": _paint_side(shape, outlines, -1),
-              "front": _paint_front(shape, outlines), "rear": _paint_rear(shape, outlines), "top": _paint_top(shape), "under": _paint_under(shape),
+              "front": _paint_front(shape, outlines), "rear": _paint_rear(shape, outlines), "top": _paint_top(shape),
+              "under": _paint_under(shape),
               "front_plate": _paint_plate(shape, outlines["front_plate"], 1),
               "rear_plate": _paint_plate(shape, outlines["rear_plate"], -1)}  # fmt: skip
     mesh, face_material = _joined(parts, list(materials))
@@ -445,18 +460,18 @@ def _handles_and_mirror(s: CarShape, outlines: dict[str, np.ndarray]) -> list[Pa
     for name in ("side_front_handle", "side_rear_handle"):
         (x0, z0), (x1, z1) = outlines[name]
         centre = surface_point(s, "side", (x0 + x1) / 2, (z0 + z1) / 2)
-        parts.append(blob_part(centre + (0, 0.008, 0), ((x0 - x1) / 2 + 0.008, 0.022, 0.016), 0.7, "trim"))
+        parts.append(blob_part(centre + np.array([0, 0.008, 0]), ((x0 - x1) / 2 + 0.008, 0.022, 0.016), 0.7, "trim"))
     a_x, a_z = outlines["side_front_door"][0]
     foot = surface_point(s, "side", a_x - 0.12, a_z + 0.03)
-    parts.append(blob_part(foot + (0, 0.10, 0.07), (0.07, 0.105, 0.068), 0.45, "paint"))
-    parts.append(blob_part(foot + (-0.045, 0.10, 0.07), (0.032, 0.092, 0.056), 0.5, "trim"))
-    parts.append(blob_part(foot + (0, 0.01, 0.01), (0.045, 0.05, 0.022), 0.4, "trim"))
+    parts.append(blob_part(foot + np.array([0, 0.10, 0.07]), (0.07, 0.105, 0.068), 0.45, "paint"))
+    parts.append(blob_part(foot + np.array([-0.045, 0.10, 0.07]), (0.032, 0.092, 0.056), 0.5, "trim"))
+    parts.append(blob_part(foot + np.array([0, 0.01, 0.01]), (0.045, 0.05, 0.022), 0.4, "trim"))
     return parts
 
 
 def _joined(parts: list[Part], order: list[str]) -> tuple[trimesh.Trimesh, np.ndarray]:
     """One mesh of all parts and the material index of each face."""
-    offsets = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
+    offsets = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
     mesh = trimesh.Trimesh(
         vertices=np.concatenate([p.vertices for p in parts]),
         faces=np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)]),

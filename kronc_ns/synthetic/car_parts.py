@@ -106,7 +106,9 @@ class CarShape:
         lift = rng.uniform(-0.02, 0.03)
         heights = {name: getattr(base, name) + lift for name in ("height", "cowl_height", "belt_height", "boot_height")}
         slack = drawn["length"] - drawn["wheelbase"]
-        return CarShape(**drawn, **heights, boot_length=base.boot_length, front_overhang=slack * rng.uniform(0.48, 0.51))
+        return CarShape(
+            **drawn, **heights, boot_length=base.boot_length, front_overhang=slack * rng.uniform(0.48, 0.51)
+        )
 
 
 @dataclass(frozen=True)
@@ -314,7 +316,7 @@ def flat_part(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"],
 
 
 def _revolved(profile: list[tuple[float, float]], x: float, z: float, material: str) -> Part:
-    """Surface of revolution about the line through (x, z) along y; `profile` lists (radius, y) from the hub outwards."""
+    """Surface of revolution about the line through (x, z) along y; `profile` lists (radius, y) from the hub out."""
     r, y = np.array(profile).T
     angle = np.linspace(0, 2 * np.pi, 65)
     grid = np.stack(np.broadcast_arrays(x + r * np.cos(angle)[:, None], y, z + r * np.sin(angle)[:, None]), -1)
@@ -324,9 +326,9 @@ def _revolved(profile: list[tuple[float, float]], x: float, z: float, material: 
 def wheel_parts(s: CarShape, x: float) -> list[Part]:
     """Left wheel on the axle at x, and the dark well around it."""
     r, rim, y = s.wheel_radius, s.wheel_radius * 0.70, s.width / 2 - 0.035
-    face = [(0, y - 0.020), (0.06, y - 0.020), (0.075, y - 0.035), (rim - 0.03, y - 0.022), (rim, y - 0.010)]
+    face = [(0.0, y - 0.020), (0.06, y - 0.020), (0.075, y - 0.035), (rim - 0.03, y - 0.022), (rim, y - 0.010)]
     tyre = [(rim, y - 0.010), (rim + 0.02, y), (r - 0.03, y - 0.002), (r - 0.008, y - 0.02), (r, y - 0.05),
-            (r, y - 0.16), (r - 0.03, y - 0.20), (0, y - 0.20)]  # fmt: skip
+            (r, y - 0.16), (r - 0.03, y - 0.20), (0.0, y - 0.20)]  # fmt: skip
     lowest = np.arcsin((s.clearance + 0.005 - r) / s.arch_radius)
     angle = np.linspace(lowest, np.pi - lowest, 60)
     edge = np.stack([x + s.arch_radius * np.cos(angle), 0 * angle, r + s.arch_radius * np.sin(angle)], 1)

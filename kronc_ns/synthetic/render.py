@@ -1,7 +1,7 @@
 """Ray-cast images of a procedural car: colour, mask and depth, with or without a car park around it.
 
 World axes as in the car: x forward, y left, z up, ground at z = 0, metres. Cameras are OpenCV (x right, y down,
-z forward) and the centre of the top-left pixel is (0.5, 0.5). Colours are shaded in display space, without a gamma curve.
+z forward) and the centre of the top-left pixel is (0.5, 0.5). Colours are shaded in display space, without gamma.
 """
 
 from __future__ import annotations
@@ -248,7 +248,7 @@ def _ground_levels() -> tuple[np.ndarray, ...]:
     for cells, strength in ((16, 14), (64, 12), (256, 14), (1024, 18), (size // 2, 20), (size, 26)):
         noise = rng.standard_normal((cells, cells), dtype=np.float32)
         grain += strength / 2 * cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC)
-    image = np.clip(112 + grain[..., None] * (1.0, 0.98, 0.94), 0, 255).astype(np.uint8)
+    image = np.clip(112 + grain[..., None] * np.array([1.0, 0.98, 0.94], np.float32), 0, 255).astype(np.uint8)
 
     def pixel(x: float, y: float) -> tuple[int, int]:
         return round((GROUND_HALF_M - y) * scale), round((GROUND_HALF_M - x) * scale)
@@ -268,17 +268,21 @@ def _ground_levels() -> tuple[np.ndarray, ...]:
             y = 1.55 + 2.9 * k
             stroke((row - 2.9, y), (row + 2.5, y), (226, 226, 220), 0.11)
             at = pixel(row - 3.6, y - 1.2)
-            cv2.putText(image, f"{k + 40 + int(row)}", at, cv2.FONT_HERSHEY_SIMPLEX, 0.8, (214, 196, 70), 2, cv2.LINE_AA)
-        stroke((row + 2.5, -26), (row + 2.5, 26), (226, 226, 220), 0.11)
-    for y in range(-24, 25, 6):
+            cv2.putText(
+                image, f"{k + 40 + int(row)}", at, cv2.FONT_HERSHEY_SIMPLEX, 0.8, (214, 196, 70), 2, cv2.LINE_AA
+            )
+        stroke((row + 2.5, -26.0), (row + 2.5, 26.0), (226, 226, 220), 0.11)
+    for y in np.arange(-24.0, 25.0, 6.0):
         stroke((5.4, y - 0.9), (5.4, y + 0.9), (232, 232, 226), 0.16)
-        cv2.fillPoly(image, [np.array([pixel(5.4, y + 1.7), pixel(5.9, y + 0.7), pixel(4.9, y + 0.7)])], (232, 232, 226))
-    paving = slice(pixel(-4.0, 0)[1], pixel(-7.0, 0)[1])
+        cv2.fillPoly(
+            image, [np.array([pixel(5.4, y + 1.7), pixel(5.9, y + 0.7), pixel(4.9, y + 0.7)])], (232, 232, 226)
+        )
+    paving = slice(pixel(-4.0, 0.0)[1], pixel(-7.0, 0.0)[1])
     tint = rng.integers(-22, 23, (8, 130, 1)) + np.array([26, 6, -14])
     tiles = cv2.resize(tint.astype(np.float32), (size, paving.stop - paving.start), interpolation=cv2.INTER_NEAREST)
     image[paving] = np.clip(image[paving] + tiles, 0, 255).astype(np.uint8)
     for x in np.linspace(-7.0, -4.0, 9):
-        stroke((x, -26), (x, 26), (74, 70, 66), 0.03)
+        stroke((x, -26.0), (x, 26.0), (74, 70, 66), 0.03)
     for x, y in ((3.6, 2.2), (-3.2, -3.4), (4.4, -5.2), (-9.0, 6.0)):
         cv2.circle(image, pixel(x, y), round(0.36 * scale), (70, 68, 66), -1, cv2.LINE_AA)
         cv2.circle(image, pixel(x, y), round(0.28 * scale), (128, 124, 118), 2, cv2.LINE_AA)
@@ -301,7 +305,7 @@ def _wall_levels() -> tuple[np.ndarray, ...]:
     while x < width:
         wide, tall = rng.uniform(5, 12) * scale, rng.uniform(4.5, 12.5)
         facade = rng.uniform(105, 205) + rng.uniform(-16, 16, 3)
-        block(x, x + wide, 0, tall, facade)
+        block(x, x + wide, 0.0, tall, facade)
         block(x, x + wide, tall - 0.35, tall, facade * 0.6)
         step, sill = rng.uniform(1.5, 2.6) * scale, rng.uniform(1.1, 1.7)
         for left in np.arange(x + 0.4 * step, x + wide - 0.7 * step, step):
@@ -311,7 +315,7 @@ def _wall_levels() -> tuple[np.ndarray, ...]:
         x += wide
     for _ in range(34):
         at, crown = rng.uniform(0.02, 0.98) * width, rng.uniform(2.2, 4.6)
-        block(at - 4, at + 4, 0, crown, np.array([74, 58, 44]))
+        block(at - 4, at + 4, 0.0, crown, np.array([74, 58, 44]))
         for _ in range(26):
             centre = (round(at + rng.normal(0, 0.8 * scale)), round(height - (crown + rng.normal(0, 0.7)) * scale))
             green = rng.uniform(0.6, 1.2) * np.array([66, 98, 46])

@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 import trimesh
 
-from kronc_ns.synthetic.car import MIRROR, CarModel, CarShape, build_car, features
+from kronc_ns.synthetic.car import METRES_PER_TEXEL, MIRROR, CarModel, CarShape, build_car, features
 from kronc_ns.synthetic.car_parts import STYLES
+from kronc_ns.synthetic.render import keypoint_visibility
 
-SHAPES = {name: CarShape(**fields) for name, fields in STYLES.items()}
-SHAPES["random"] = CarShape.random(np.random.default_rng(0))
+SHAPES = {
+    "hatchback": CarShape(),
+    "saloon": CarShape(**STYLES["saloon"]),
+    "random": CarShape.random(np.random.default_rng(104)),
+}
 
 
-@pytest.fixture(scope="module", params=SHAPES, ids=list(SHAPES))
+@lru_cache
+def built(name: str) -> CarModel:
+    return build_car(SHAPES[name])
+
+
+@pytest.fixture(params=SHAPES)
 def car(request: pytest.FixtureRequest) -> CarModel:
-    return build_car(SHAPES[request.param])
+    return built(request.param)
 
 
 def test_keypoints_lie_on_the_mesh(car: CarModel) -> None:
     _, distance, _ = trimesh.proximity.closest_point(car.mesh, car.keypoints)
-    assert car.keypoints.shape == (66, 3) and car.keypoints.dtype == np.float64
+    assert car.keypoints.shape == (66, 3)
+    assert car.keypoints.dtype == np.float64
     assert distance.max() < 1e-3
 
 
@@ -28,7 +40,7 @@ def test_keypoints_and_mesh_are_mirror_symmetric(car: CarModel) -> None:
     flip = np.array([1.0, -1.0, 1.0])
     np.testing.assert_allclose(car.keypoints[MIRROR], car.keypoints * flip, atol=1e-9)
     np.testing.assert_array_equal(MIRROR[MIRROR], np.arange(66))
-    assert not np.any(MIRROR == np.arange(66))
+    assert (np.arange(66) != MIRROR).all()
     vertices = np.unique(np.round(car.mesh.vertices, 6) + 0.0, axis=0)
     mirrored = np.unique(np.round(car.mesh.vertices * flip, 6) + 0.0, axis=0)
     np.testing.assert_allclose(vertices, mirrored, atol=1e-9)
@@ -56,36 +68,53 @@ def test_normals_are_unit_and_body_normals_point_outwards(car: CarModel) -> None
 def test_keypoints_have_their_meaning(car: CarModel) -> None:
     k, s = car.keypoints, car.shape
     left = np.arange(29)
-    assert (k[left, 1] > 0.2).all() and (k[MIRROR[left], 1] < -0.2).all()
+    assert (k[left, 1] > 0.2).all()
+    assert (k[MIRROR[left], 1] < -0.2).all()
     for wheel, x in ((7, s.front_axle_x), (20, s.rear_axle_x)):
         np.testing.assert_allclose(k[wheel, [0, 2]], [x, s.wheel_radius], atol=1e-3)
         assert s.width / 2 - 0.12 < k[wheel, 1] < s.width / 2
-    assert k[6, 0] > k[7, 0] + s.wheel_radius and k[21, 0] < k[20, 0] - s.wheel_radius
+    assert k[6, 0] > k[7, 0] + s.wheel_radius
+    assert k[21, 0] < k[20, 0] - s.wheel_radius
     assert (k[[0, 1, 2, 3, 4, 5, 58, 59, 60, 61], 0] > s.front_axle_x).all()
     assert (k[[22, 23, 25, 26, 27, 28, 62, 63, 64, 65], 0] < s.rear_axle_x).all()
     assert (k[[0, 2, 4, 59, 62, 22, 25], 2] > k[[1, 3, 5, 61, 65, 23, 26], 2] + 0.05).all()
     assert (k[[2, 3, 22, 23], 1] > k[[0, 1, 25, 26], 1] + 0.2).all()
     assert k[9, 0] > k[13, 0] > k[14, 0] > k[12, 0] > k[17, 0] > k[18, 0] > k[20, 0]
-    assert s.height > k[8, 2] > k[9, 2] > k[13, 2] > k[10, 2] and k[11, 2] > k[12, 2] > k[14, 2] > k[15, 2]
-    assert k[49, 1] < 0 < k[8, 1] and k[8, 0] > k[11, 0] > k[24, 0]
+    assert s.height > k[8, 2] > k[9, 2] > k[13, 2] > k[10, 2]
+    assert k[11, 2] > k[12, 2] > k[14, 2] > k[15, 2]
+    assert k[49, 1] < 0 < k[8, 1]
+    assert k[8, 0] > k[11, 0] > k[24, 0]
 
 
-def test_features_are_painted_where_the_keypoints_are() -> None:
-    car = build_car()
-    lamp, rear = features(car.shape)["front_lamp"].mean(0), features(car.shape)["rear_lamp"].mean(0)
-    for name, (y, z) in (("front", lamp), ("rear", rear)):
-        layer = car.layers[name]
+def test_lamps_are_painted_where_their_keypoints_are() -> None:
+    car = built("hatchback")
+    for name, corners in (("front", [0, 1, 3, 2]), ("rear", [25, 26, 23, 22])):
+        lamp, layer = car.keypoints[corners], car.layers[name]
+        np.testing.assert_allclose(lamp[:, 1:], features(car.shape)[f"{name}_lamp"], atol=1e-6)
         for side in (1, -1):
-            column, row = (np.array([side * y * layer.right[1] - layer.corner[0], layer.corner[1] - z]) / 0.0025).astype(int)
+            middle = lamp.mean(0) * (1, side, 1) + (0, 0, 0.05)
+            column = int((middle @ layer.right - layer.corner[0]) / METRES_PER_TEXEL)
+            row = int((layer.corner[1] - middle[2]) / METRES_PER_TEXEL)
             red, green, _, alpha, _ = layer.levels[0][row, column].astype(int)
             assert alpha == 255
-            assert (red > green + 60) if name == "rear" and z > rear[1] else True
-    np.testing.assert_allclose(car.keypoints[[0, 1, 3, 2]][:, 1:].mean(0), lamp, atol=1e-6)
+            assert (red > green + 60) == (name == "rear")
+
+
+def test_every_keypoint_can_be_seen_from_somewhere(car: CarModel) -> None:
+    azimuth = np.radians(np.arange(0, 360, 10))
+    centres = np.stack([4.5 * np.cos(azimuth), 4.5 * np.sin(azimuth), np.full(36, 1.5)], 1)
+    assert keypoint_visibility(car.mesh, car.keypoints, centres).any(0).all()
+
+
+def test_impossible_dimensions_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"height 0\.9"):
+        build_car(CarShape(height=0.9))
 
 
 def test_random_shapes_vary_and_follow_the_seed() -> None:
     shapes = [CarShape.random(np.random.default_rng(seed)) for seed in range(20)]
     assert shapes[3] == CarShape.random(np.random.default_rng(3))
     assert len({s.length for s in shapes}) == 20
-    assert np.ptp([s.height for s in shapes]) > 0.1 and np.ptp([s.boot_length for s in shapes]) > 0.3
+    assert np.ptp([s.height for s in shapes]) > 0.1
+    assert np.ptp([s.boot_length for s in shapes]) > 0.3
     assert all(s.rear_axle_x - s.arch_radius > -s.length / 2 + 0.2 for s in shapes)

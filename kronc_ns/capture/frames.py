@@ -1,0 +1,204 @@
+"""The frames of a capture in nerfstudio's layout: images/frame_00001.png, images_2/frame_00001.png, ..."""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from kronc_ns.capture.images import (
+    copy_upright,
+    downscale_factors,
+    level_path,
+    load_image,
+    upright_size,
+    write_downscales,
+)
+from kronc_ns.capture.source import IMAGE_SUFFIXES, MIN_FRAMES, Count, Source
+from kronc_ns.capture.video import extract_frames, probe_video
+from kronc_ns.errors import KroncError
+from kronc_ns.files import write_json
+from kronc_ns.keypoints.io import read_json
+
+RECORD = ".kronc-frames.json"
+"""Says which source the frames of an output folder are from, so that a second run need not make them again."""
+_OURS = re.compile(r"frame_\d{5,}\.(npy|" + "|".join(suffix[1:] for suffix in IMAGE_SUFFIXES) + ")", re.IGNORECASE)
+_FOLDERS = re.compile(r"(images|masks|depths)(_\d+)?")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames as they lie in the output folder."""
+
+    names: tuple[str, ...]
+    """``file_path`` of each: images/frame_00001.png."""
+    source_names: tuple[str, ...]
+    """What the source calls each of them; the same as `names` for a video."""
+    size: tuple[int, int]
+    """(width, height) of all of them."""
+    factors: tuple[int, ...]
+    """Downscaled copies there are."""
+    reused: bool
+    """They were there already, made from the same source by an earlier run."""
+
+
+def check_source(source: Source) -> tuple[int, int] | None:
+    """At least 3 readable images of one size, which is returned, or a readable video; looks at the headers only."""
+    if source.kind == "video":
+        probe_video(source.path)
+        return None
+    if len(source.images) < MIN_FRAMES:
+        raise KroncError(
+            f"{source.path} holds {len(source.images)} images: expected at least {MIN_FRAMES} views of the car"
+        )
+    orient = source.camera is None
+    first = upright_size(source.images[0], orient)
+    for image in source.images[1:]:
+        size = upright_size(image, orient)
+        if size != first:
+            raise KroncError(
+                f"images of different sizes: {source.images[0]} is {_by(first)}, {image} is {_by(size)}: "
+                "expected one camera held one way; remove or crop those that differ"
+            )
+    if source.camera is not None and first != (source.camera.width, source.camera.height):
+        raise KroncError(
+            f"{source.images[0]} is {_by(first)}, {source.path / 'transforms.json'} says "
+            f"{source.camera.width}x{source.camera.height}: expected intrinsics in the pixels of the images"
+        )
+    return first
+
+
+def prepare_frames(
+    source: Source,
+    out: Path,
+    fps: float = 5.0,
+    num_frames_target: int | None = None,
+    num_downscales: int = 3,
+    keep: Sequence[Path] = (),
+    progress: Count | None = None,
+) -> Frames:
+    """Extract or copy the frames of ``source`` into ``out`` with downscaled copies, or find them there already.
+
+    Photos are turned upright as their EXIF says; images of a scene folder are copied as they are stored, since
+    its transforms.json speaks of those pixels. Frames of an earlier run are removed first, but nothing in ``keep``.
+    """
+    signature = _signature(source, fps, num_frames_target, num_downscales)
+    found = _recorded(out, signature)
+    if found is not None:
+        return found
+    (out / RECORD).unlink(missing_ok=True)
+    _clear(out, keep)
+    (out / "images").mkdir(exist_ok=True)
+    count = progress or (lambda *_: None)
+    if source.kind == "video":
+        images = extract_frames(source.path, out / "images", fps, num_frames_target, count)
+        names = tuple(f"images/{image.name}" for image in images)
+        source_names = names
+    else:
+        images = source.images
+        names, source_names = frame_names(images), source.names
+    factors = downscale_factors(upright_size(images[0], source.camera is None), num_downscales)
+
+    def write(image: Path, name: str) -> None:
+        target = out / name
+        whole = load_image(image) if source.kind == "video" else copy_upright(image, target, source.camera is None)
+        write_downscales(whole, target, factors)
+
+    _for_each(write, list(zip(images, names, strict=True)), count)
+    size = upright_size(out / names[0], orient=False)
+    content = {"source": signature, "size": size, "factors": factors, "names": names, "source_names": source_names}
+    write_json(out / RECORD, content)
+    return Frames(names, source_names, size, factors, reused=False)
+
+
+def frame_names(images: Sequence[Path]) -> tuple[str, ...]:
+    """New paths: files that are all called frame_NNNNN keep their names, others are counted from 1."""
+    if all(_OURS.fullmatch(image.name) for image in images) and len({image.name for image in images}) == len(images):
+        return tuple(f"images/{image.name}" for image in images)
+    return tuple(f"images/frame_{number:05d}{image.suffix.lower()}" for number, image in enumerate(images, start=1))
+
+
+def copy_depths(source: Source, frames: Frames, out: Path) -> tuple[str, ...] | None:
+    """Copy the depth maps of a scene folder; their new paths."""
+    if source.depths is None:
+        return None
+    (out / "depths").mkdir(exist_ok=True)
+    stems = (PurePosixPath(name).stem for name in frames.names)
+    names = tuple(f"depths/{stem}{depth.suffix}" for stem, depth in zip(stems, source.depths, strict=True))
+    for depth, name in zip(source.depths, names, strict=True):
+        shutil.copyfile(depth, out / name)
+    return names
+
+
+def copy_reference(source: Source, frames: Frames, out: Path) -> None:
+    """Copy ``reference.json`` with the new names of the frames, for `kronc eval`."""
+    if source.reference is None:
+        return
+    content = read_json(source.reference)
+    listed = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(listed, list) or not all(isinstance(f, dict) and "file_path" in f for f in listed):
+        raise KroncError(
+            f'{source.reference}: expected "frames", a list of objects with "file_path"; mend or remove it'
+        )
+    renamed = dict(zip(source.names, frames.names, strict=True))
+    renamed |= {PurePosixPath(old).name: new for old, new in renamed.items()}
+    known = []
+    for frame in listed:
+        old = str(frame["file_path"])
+        name = renamed.get(old) or renamed.get(PurePosixPath(old).name)
+        if name is not None:
+            poses_only = {key: value for key, value in frame.items() if not key.endswith("_path")}
+            known.append({"file_path": name, **poses_only})
+    without_files = {key: value for key, value in content.items() if not key.endswith("_path")}
+    write_json(out / "reference.json", {**without_files, "frames": known})
+
+
+def _for_each(work: Callable[..., None], items: list[tuple], count: Count) -> None:
+    """Do ``work`` on all items with a few threads (decoding and scaling release the GIL); the first error ends it."""
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        futures = [pool.submit(work, *item) for item in items]
+        try:
+            for done, future in enumerate(futures, start=1):
+                future.result()
+                count(done, len(items), None)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _signature(source: Source, *settings: float | int | None) -> str:
+    """Hash of everything the frames depend on: files by path, size and time of change."""
+    files: Iterable[Path] = source.images or (source.path,)
+    states = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    text = json.dumps([states, source.names, source.camera is None, settings])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _recorded(out: Path, signature: str) -> Frames | None:
+    try:
+        content = read_json(out / RECORD)
+        width, height = content["size"]
+        names, factors = tuple(content["names"]), tuple(content["factors"])
+        frames = Frames(names, tuple(content["source_names"]), (width, height), factors, reused=True)
+    except (KroncError, KeyError, TypeError, ValueError):
+        return None
+    paths = [level_path(out / name, factor) for name in names for factor in (1, *factors)]
+    return frames if content["source"] == signature and all(path.is_file() for path in paths) else None
+
+
+def _clear(out: Path, keep: Sequence[Path]) -> None:
+    """Remove frames, masks and depth maps of an earlier run; only files called as we call them."""
+    kept = {path.resolve() for path in keep}
+    for folder in out.iterdir():
+        if folder.is_dir() and _FOLDERS.fullmatch(folder.name) and folder.resolve() not in kept:
+            for file in folder.iterdir():
+                if _OURS.fullmatch(file.name):
+                    file.unlink()
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

@@ -1,0 +1,139 @@
+"""Where the focal length comes from: a calibration, the user, the photos' EXIF, or a stated assumption."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from PIL import ExifTags, Image
+
+from kronc_ns.errors import KroncError
+from kronc_ns.geometry.camera import Camera
+
+FULL_FRAME_DIAGONAL_MM = 43.27
+"""Diagonal of 36 mm x 24 mm: what 35 mm equivalent focal lengths refer to (CIPA's convention for all aspect ratios)."""
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # EXIF FocalPlaneResolutionUnit
+_SAME_FOCAL = 0.01  # photos whose focal lengths differ by more were zoomed
+_SAME_ASPECT = 0.01  # EXIF size and image of another aspect ratio: the photo was cropped
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """The camera of a capture, and why it should be believed."""
+
+    camera: Camera
+    source: str
+    """Where the focal length came from, in words."""
+    assumed: bool = False
+    """Nobody said it: it is the assumed field of view."""
+
+
+def find_intrinsics(
+    size: tuple[int, int],
+    photos: Sequence[Path] = (),
+    given: Camera | None = None,
+    focal_length_px: float | None = None,
+    fov_deg: float = 65.0,
+) -> Intrinsics:
+    """Intrinsics for images of ``size`` (width, height): the user's word first, then the file's, then EXIF.
+
+    Where none of them says, the longer side is assumed to span ``fov_deg``. The principal point is the image
+    centre unless ``given`` says otherwise.
+    """
+    if given is not None and (given.width, given.height) != size:
+        raise KroncError(
+            f"the intrinsics are for {given.width}x{given.height} images, the images are {size[0]}x{size[1]}: "
+            "expected intrinsics in the pixels of the images"
+        )
+    if focal_length_px is not None:
+        camera = replace(given, fx=focal_length_px, fy=focal_length_px) if given else _centred(focal_length_px, size)
+        return Intrinsics(camera, "--focal-length-px")
+    if given is not None:
+        return Intrinsics(given, "transforms.json")
+    found, why_not = exif_focal_px(photos)
+    if found is not None:
+        return Intrinsics(_centred(found.px, size), found.source)
+    if not 1 <= fov_deg <= 170:
+        raise KroncError(f"--fov-deg is {fov_deg:g}: expected degrees across the longer side, from 1 to 170")
+    focal = max(size) / 2 / math.tan(math.radians(fov_deg) / 2)
+    reason = f" ({why_not})" if why_not else ""
+    return Intrinsics(_centred(focal, size), f"assumed field of view of {fov_deg:g} deg{reason}", assumed=True)
+
+
+@dataclass(frozen=True)
+class ExifFocal:
+    """A focal length from EXIF, in pixels of the image as stored."""
+
+    px: float
+    source: str
+
+
+def exif_focal_px(photos: Sequence[Path]) -> tuple[ExifFocal | None, str]:
+    """The one focal length of all photos that say it (None: none does, and why).
+
+    Raises `KroncError` where two photos disagree: a scene has one camera.
+    """
+    found: dict[Path, ExifFocal] = {}
+    why_not = ""
+    for photo in photos:
+        focal, reason = read_exif_focal(photo)
+        why_not = why_not or reason
+        if focal is not None:
+            found[photo] = focal
+    if not found:
+        return None, why_not
+    shortest, longest = (pick(found, key=lambda photo: found[photo].px) for pick in (min, max))
+    if found[longest].px > found[shortest].px * (1 + _SAME_FOCAL):
+        raise KroncError(
+            f"EXIF gives {shortest} a focal length of {found[shortest].px:.0f} px, {longest} {found[longest].px:.0f}: "
+            "expected photos of one zoom setting; remove the others, or give --focal-length-px"
+        )
+    first = next(iter(found.values()))
+    share = "" if len(found) == len(photos) else f" of {len(found)} of {len(photos)} photos"
+    return replace(first, source=f"EXIF{share}: {first.source}"), ""
+
+
+def read_exif_focal(photo: Path) -> tuple[ExifFocal | None, str]:
+    """Focal length of one photo from its EXIF, or why there is none.
+
+    FocalLength with the sensor's pixel pitch (FocalPlaneXResolution), which needs the recorded image size to be
+    scaled to this file; else FocalLengthIn35mmFilm. A photo cropped after it was taken says nothing.
+    """
+    with Image.open(photo) as image:
+        exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        size = image.size
+    recorded = (_number(exif.get(ExifTags.Base.ExifImageWidth)), _number(exif.get(ExifTags.Base.ExifImageHeight)))
+    if min(recorded) > 0 and abs(_aspect(size) / _aspect(recorded) - 1) > _SAME_ASPECT:
+        return (
+            None,
+            f"{photo.name} is {size[0]}x{size[1]}, its EXIF is of a {recorded[0]:g}x{recorded[1]:g} photo: cropped",
+        )
+    focal_mm = _number(exif.get(ExifTags.Base.FocalLength))
+    per_unit = _number(exif.get(ExifTags.Base.FocalPlaneXResolution))
+    unit_mm = _MM_PER_UNIT.get(int(_number(exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))), 0.0)
+    if min(focal_mm, per_unit, unit_mm, *recorded) > 0:
+        px = focal_mm * per_unit / unit_mm * max(size) / max(recorded)
+        sensor_mm = max(recorded) / per_unit * unit_mm
+        return ExifFocal(px, f"{focal_mm:g} mm on a {sensor_mm:.1f} mm wide sensor"), ""
+    film_mm = _number(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    if film_mm > 0:
+        return ExifFocal(film_mm * math.hypot(*size) / FULL_FRAME_DIAGONAL_MM, f"{film_mm:g} mm in 35 mm film"), ""
+    return None, "no focal length in the photos' EXIF"
+
+
+def _centred(focal_px: float, size: tuple[int, int]) -> Camera:
+    return Camera(focal_px, focal_px, size[0] / 2, size[1] / 2, *size)
+
+
+def _aspect(size: tuple[float, float]) -> float:
+    return max(size) / min(size)
+
+
+def _number(value: Any) -> float:
+    """A finite EXIF number, else 0 (EXIF's own word for unknown)."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 0.0
+    return number if math.isfinite(number) else 0.0

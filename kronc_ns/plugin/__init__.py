@@ -1,0 +1,1 @@
+"""The nerfstudio side: the only part of the package that imports nerfstudio."""

@@ -1,0 +1,193 @@
+"""`ns-process-data kronc` and its twin `kronc-process-data`: video or photos to a dataset with solved poses."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Union
+
+import tyro
+from rich.console import Console
+
+from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, prepare_frames
+from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics
+from kronc_ns.capture.masks import find_masks, write_masks
+from kronc_ns.capture.source import MIN_FRAMES, Source, find_source
+from kronc_ns.config import SolverOptions
+from kronc_ns.console import exit_on_error, exit_status, progress_bar, solution_table
+from kronc_ns.errors import KroncError
+from kronc_ns.export import claim_output, transforms_dict, write_solution
+from kronc_ns.files import write_json
+from kronc_ns.geometry.camera import Camera
+from kronc_ns.keypoints.io import FORMATS, Detections, read_keypoints, write_keypoints
+from kronc_ns.pipeline import fingerprint, solve_scene
+from kronc_ns.scene import load_scene, match_keypoints
+
+
+@dataclass
+class KroncToNerfstudio:
+    """Process a walk around a car: camera poses from its semantic keypoints.
+
+    A detector such as OpenPifPaf makes the keypoints; it is no part of this program.
+    Run without them to get the frames and be told how to go on.
+    """
+
+    data: Path
+    """Video, folder of photos, or scene folder (transforms.json with intrinsics, images, keypoints.json)."""
+    output_dir: Path
+    """New or empty folder, or one that this command wrote; gets nerfstudio's layout and kronc.json."""
+    keypoints: Path | None = None
+    """Our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON. Default: those in DATA."""
+    masks: Path | None = None
+    """Folder with a mask for each image, of the same stem: above 127 the car, else ignored."""
+    fps: float = 5.0
+    """Frames per second taken from a video."""
+    num_frames_target: int | None = None
+    """Take about this many frames from a video, evenly spread, instead of --fps."""
+    focal_length_px: float | None = None
+    """Focal length in pixels of the full-size image. Default: from transforms.json, else from EXIF."""
+    fov_deg: float = 65.0
+    """Field of view across the longer side that is assumed where nothing tells the focal length."""
+    num_downscales: int = 3
+    """Downscaled copies: 3 makes images_2, images_4 and images_8, while the smaller side keeps 100 px."""
+    solve: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
+    """How the poses are solved."""
+
+    def main(self) -> None:
+        """Process, and end the program with the status of what happened (0, 2, 3 or 130)."""
+        with exit_on_error():
+            status = self.run()
+        if status:
+            sys.exit(status)
+
+    def run(self) -> int:
+        """Process; raises `KroncError` for what the user can mend. Returns 3 for a doubtful solution, else 0."""
+        config = self.solve.solver_config()
+        self._check_options()
+        source = find_source(self.data)
+        size = check_source(source)
+        found = self._read_keypoints(source)
+        early = None if size is None else self._intrinsics(source, size)
+        claim_output(self.output_dir)
+
+        out = self.output_dir
+        keep = [path for path in (self.masks, self.keypoints) if path is not None]
+        with progress_bar("frames") as progress:
+            frames = prepare_frames(
+                source, out, self.fps, self.num_frames_target, self.num_downscales, keep=keep, progress=progress
+            )
+        intrinsics = early or self._intrinsics(source, frames.size)
+        if intrinsics.assumed:
+            print(_assumption(intrinsics), file=sys.stderr)
+        masks = self._write_masks(source, frames)
+        transforms = transforms_dict(
+            intrinsics.camera, frames.names, source.c2w, masks, copy_depths(source, frames, out)
+        )
+        write_json(out / "transforms.json", transforms)
+        copy_reference(source, frames, out)
+        if found is None:
+            raise KroncError(_how_to_go_on(frames, out))
+        note = _write_keypoints(found, frames, intrinsics.camera, masks, out)
+
+        scene = load_scene(out)
+        with progress_bar("solving") as progress:
+            solution = solve_scene(scene, config, progress)
+        write_solution(out, scene, solution, out, fingerprint(scene, config))
+
+        table = solution_table(solution, (*scene.notes, *([note] if note else [])))
+        levels = "".join(f", 1/{factor}" for factor in frames.factors)
+        origin = "as an earlier run left them" if frames.reused else f"from {source.kind} {self.data}"
+        table.add_row("frames", f"{len(frames.names)} of {frames.size[0]}x{frames.size[1]}{levels}, {origin}")
+        table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}")
+        Console().print(table)
+        status = exit_status(solution)
+        if status == 0:
+            print(f"ns-train nerfacto --data {out}")
+        return status
+
+    def _check_options(self) -> None:
+        if not self.fps > 0:
+            raise KroncError(f"--fps is {self.fps:g}: expected a number above 0")
+        if self.num_frames_target is not None and self.num_frames_target < MIN_FRAMES:
+            raise KroncError(f"--num-frames-target is {self.num_frames_target}: expected at least {MIN_FRAMES}")
+        if self.num_downscales < 0:
+            raise KroncError(f"--num-downscales is {self.num_downscales}: expected 0 or more")
+        data, out = self.data.resolve(), self.output_dir.resolve()
+        if data == out or out in data.parents:
+            raise KroncError(f"--data {self.data} lies in --output-dir {self.output_dir}: choose another output folder")
+        if self.masks is not None and not self.masks.is_dir():
+            raise KroncError(f"--masks {self.masks} is no folder: expected one mask image per photo, of the same stem")
+
+    def _read_keypoints(self, source: Source) -> Detections | None:
+        """Detections, or None where a first run without them makes sense."""
+        path = self.keypoints or source.keypoints
+        if path is not None:
+            return read_keypoints(path)
+        if source.kind == "scene folder":
+            raise KroncError(
+                f"{self.data} has no keypoints.json: give --keypoints ({FORMATS}), which a detector such as "
+                "OpenPifPaf makes; it is no part of this package"
+            )
+        if (self.output_dir / "kronc.json").exists():
+            raise KroncError(f"{self.output_dir} is solved already: give --keypoints to solve it anew ({FORMATS})")
+        return None
+
+    def _intrinsics(self, source: Source, size: tuple[int, int]) -> Intrinsics:
+        return find_intrinsics(size, source.images, source.camera, self.focal_length_px, self.fov_deg)
+
+    def _write_masks(self, source: Source, frames: Frames) -> tuple[str, ...] | None:
+        masks = self.masks or source.masks
+        return None if masks is None else write_masks(find_masks(masks, frames), frames, self.output_dir)
+
+
+def extend_commands(script: ModuleType) -> None:
+    """Add the subcommand ``kronc`` to nerfstudio's ``ns-process-data`` module; called by the import hook."""
+    subcommand = Annotated[KroncToNerfstudio, tyro.conf.subcommand(name="kronc")]
+    script.Commands = Union[script.Commands, subcommand]  # pyright: ignore[reportAttributeAccessIssue]  # noqa: UP007
+
+
+def main() -> None:
+    """Entry point of `kronc-process-data`."""
+    tyro.cli(KroncToNerfstudio, prog="kronc-process-data").main()
+
+
+def _write_keypoints(
+    found: Detections, frames: Frames, camera: Camera, masks: tuple[str, ...] | None, out: Path
+) -> str:
+    """Write the detections of one car as OUT/keypoints.json under the new names; a note on choices made."""
+    target = out / "keypoints.json"
+    if found.source.resolve() == target.resolve():
+        return ""
+    names = frames.source_names if _covers(frames.source_names, found) else frames.names
+    if not _covers(names, found):
+        names = frames.source_names
+    rows, note = match_keypoints(found, names, camera, [out / mask for mask in masks] if masks else None)
+    write_keypoints(target, found.schema, frames.size, dict(zip(frames.names, rows, strict=True)))
+    return note
+
+
+def _covers(names: tuple[str, ...], found: Detections) -> bool:
+    """Whether every image that ``found`` knows has one of these paths or file names."""
+    files = {Path(name).name for name in names}
+    return all(Path(key).name in files for key in found.frames)
+
+
+def _assumption(intrinsics: Intrinsics) -> str:
+    return (
+        f"warning: focal length {intrinsics.camera.fx:.0f} px is an {intrinsics.source}; "
+        "give --focal-length-px or a calibrated transforms.json for exact poses"
+    )
+
+
+def _how_to_go_on(frames: Frames, out: Path) -> str:
+    images = out / "images"
+    return (
+        f"{len(frames.names)} frames are ready in {images}, but there are no keypoints ({FORMATS}): detect them, e.g. "
+        "`python -m openpifpaf.predict --checkpoint shufflenetv2k16-apollo-66 --json-output "
+        f"--glob '{images}/frame_*[0-9]{Path(frames.names[0]).suffix}'`, "
+        f"then run the same command again with `--keypoints {images}`"
+    )
+
+
+if __name__ == "__main__":
+    main()

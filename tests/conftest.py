@@ -1,0 +1,68 @@
+"""Shared fixtures; jaxtyping annotations are checked at run time in every test."""
+
+import json
+from pathlib import Path
+
+import jaxtyping
+import pytest
+
+with jaxtyping.install_import_hook(
+    ["kronc_ns.geometry", "kronc_ns.objective", "kronc_ns.init", "kronc_ns.solve", "kronc_ns.keypoints", "kronc_ns.evaluate"],
+    "beartype.beartype",
+):
+    import kronc_ns.evaluate
+    import kronc_ns.init
+    import kronc_ns.keypoints.select
+    import kronc_ns.objective
+    import kronc_ns.solve.adam  # noqa: F401
+
+import torch
+
+from kronc_ns.scene import Scene
+from kronc_ns.synthetic.folder import write_capture
+from kronc_ns.synthetic.scenes import Capture, make_capture
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def spin_suv() -> Path:
+    """The real turntable capture beside the project."""
+    folder = SHARED_DATA / "spin_suv"
+    if not folder.is_dir():
+        pytest.skip(f"the real capture is not beside the project ({folder})")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def walk_capture() -> Capture:
+    """A walk of 16 views with half a pixel of noise."""
+    return make_capture("walk", views=16, seed=7, noise_px=0.5)
+
+
+@pytest.fixture
+def walk_folder(tmp_path: Path, walk_capture: Capture) -> Path:
+    """The walk as a scene folder without images; tests may change its files."""
+    folder = tmp_path / "walk"
+    write_capture(folder, walk_capture)
+    return folder
+
+
+@pytest.fixture
+def edit():
+    """Change a JSON file in place: edit(path, function of its content)."""
+
+    def apply(path: Path, change) -> None:
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+    return apply
+
+
+def scene_of(capture: Capture, given: torch.Tensor | None = None) -> Scene:
+    """A capture as a scene in memory."""
+    from kronc_ns.keypoints.schema import APOLLOCAR3D_66
+
+    names = tuple(f"images/frame_{i + 1:05d}.png" for i in range(len(capture.c2w)))
+    return Scene(names, capture.camera, APOLLOCAR3D_66, capture.keypoints, given)
