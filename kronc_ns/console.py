@@ -53,7 +53,8 @@ def progress_bar(description: str) -> Iterator[Callable[[int, int, float | None]
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(description, total=None, loss="", visible=False)
 
         def advance(step: int, steps: int, loss: float | None) -> None:

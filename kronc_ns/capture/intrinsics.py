@@ -105,10 +105,8 @@ def read_exif_focal(photo: Path) -> tuple[ExifFocal | None, str]:
         size = image.size
     recorded = (_number(exif.get(ExifTags.Base.ExifImageWidth)), _number(exif.get(ExifTags.Base.ExifImageHeight)))
     if min(recorded) > 0 and abs(_aspect(size) / _aspect(recorded) - 1) > _SAME_ASPECT:
-        return (
-            None,
-            f"{photo.name} is {size[0]}x{size[1]}, its EXIF is of a {recorded[0]:g}x{recorded[1]:g} photo: cropped",
-        )
+        whole = f"{recorded[0]:g}x{recorded[1]:g}"
+        return None, f"{photo.name} is {size[0]}x{size[1]}, cropped from the {whole} that its EXIF is about"
     focal_mm = _number(exif.get(ExifTags.Base.FocalLength))
     per_unit = _number(exif.get(ExifTags.Base.FocalPlaneXResolution))
     unit_mm = _MM_PER_UNIT.get(int(_number(exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))), 0.0)

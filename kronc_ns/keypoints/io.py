@@ -26,7 +26,7 @@ class Detections:
 
     source: Path
     schema: KeypointSchema
-    frames: Mapping[str, Float[np.ndarray, "m j 3"]]
+    frames: Mapping[str, Float[np.ndarray, "_ j 3"]]
     """Image path or name as the file gives it -> its M instances of (u, v, confidence); confidence 0: not seen."""
     size: tuple[int, int] | None = None
     """(width, height) of the images, where the file says."""

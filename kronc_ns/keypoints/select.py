@@ -9,7 +9,7 @@ _SWITCH_WEIGHT = 2.0  # how much a jump of the car between neighbouring frames c
 
 
 def select_instances(
-    instances: Sequence[Float[np.ndarray, "m j 3"]],
+    instances: Sequence[Float[np.ndarray, "_ j 3"]],
     size: tuple[int, int],
     masks: Sequence[Integer[np.ndarray, "h w"] | None] | None = None,
 ) -> tuple[Float[np.ndarray, "n j 3"], str]:
@@ -20,9 +20,8 @@ def select_instances(
     its size and nearness to the image centre; a jump of place or size between frames costs. The best path
     through all frames is found exactly (dynamic programming). A frame without any car gets rows of zeros.
     """
-    count = max((len(rows[0]) for rows in instances if len(rows)), default=0)
     filled = [i for i, rows in enumerate(instances) if len(rows)]
-    chosen = np.zeros((len(instances), count, 3))
+    chosen = np.zeros((len(instances), *instances[0].shape[1:]))
     if not filled:
         return chosen, "no car found in any image"
     boxes = [_boxes(instances[i], size) for i in filled]

@@ -204,7 +204,7 @@ def minimise(
             optimiser.param_groups[0]["lr"] = floor + (config.learning_rate - floor) * cosine
             if step % report_every == 0 or step == 1:
                 value = gradient.value(norms)
-                history["step"].append(step)
+                history["step"].append(float(step))
                 history["loss"].append(value)
                 if progress is not None:
                     progress(step, value)

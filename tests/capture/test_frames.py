@@ -184,7 +184,13 @@ def test_a_second_run_reuses_frames_until_the_source_changes(tmp_path: Path):
     fewer = _prepare(tmp_path / "photos", out)
     assert not fewer.reused
     left = sorted(file.name for file in (out / "images").iterdir())
-    assert left == ["frame_00001.png", "frame_00001.png.predictions.json", "frame_00002.png", "frame_00003.png", "mine.png"]
+    assert left == [
+        "frame_00001.png",
+        "frame_00001.png.predictions.json",
+        "frame_00002.png",
+        "frame_00003.png",
+        "mine.png",
+    ]
     (out / "images" / "frame_00002.png").unlink()
     assert not _prepare(tmp_path / "photos", out).reused
 
@@ -272,7 +278,19 @@ def test_rotation_of_a_video_is_honoured(tmp_path: Path):
     subprocess.run(command, check=True)
     probe = subprocess.run(["ffprobe", "-v", "error", "-show_streams", str(turned)], capture_output=True, text=True)
     if "rotation" not in probe.stdout:
-        command = ["ffmpeg", "-v", "error", "-y", "-display_rotation", "90", "-i", str(plain), "-c", "copy", str(turned)]
+        command = [
+            "ffmpeg",
+            "-v",
+            "error",
+            "-y",
+            "-display_rotation",
+            "90",
+            "-i",
+            str(plain),
+            "-c",
+            "copy",
+            str(turned),
+        ]
         subprocess.run(command, check=True)
     frames = _prepare(turned, tmp_path / "out")
     assert frames.size == (48, 64)
@@ -299,5 +317,5 @@ def test_videos_that_cannot_be_used_are_named(tmp_path: Path):
 def test_a_missing_ffmpeg_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "walk.mp4").touch()
     monkeypatch.setattr(video_module.shutil, "which", lambda _: None)
-    with pytest.raises(KroncError, match="ffprobe is not on PATH.*install ffmpeg"):
+    with pytest.raises(KroncError, match=r"ffprobe is not on PATH.*install ffmpeg"):
         check_source(find_source(tmp_path / "walk.mp4"))

@@ -70,7 +70,10 @@ def test_sensor_pitch_gives_the_focal_length(tmp_path: Path, unit: int, mm: floa
 
 def test_sensor_pitch_needs_the_recorded_size(tmp_path: Path):
     photo = _photo(
-        tmp_path / "a.jpg", FocalLength=IFDRational(50, 1), FocalPlaneXResolution=IFDRational(1000, 1), FocalPlaneResolutionUnit=4
+        tmp_path / "a.jpg",
+        FocalLength=IFDRational(50, 1),
+        FocalPlaneXResolution=IFDRational(1000, 1),
+        FocalPlaneResolutionUnit=4,
     )
     assert find_intrinsics(SIZE, [photo]).assumed
 

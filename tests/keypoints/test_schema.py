@@ -1,0 +1,47 @@
+import json
+
+import pytest
+
+from kronc_ns.errors import KroncError
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
+from tests.conftest import SHARED_DATA
+
+
+def test_flip_is_an_involution_between_the_sides():
+    schema = APOLLOCAR3D_66
+    assert len(schema) == 66
+    assert len(set(schema.keypoints)) == 66
+    assert all(schema.flip[schema.flip[i]] == i for i in range(66))
+    assert {schema.flip[i] for i in schema.left} == set(range(66)) - set(schema.left)
+
+
+def test_skeleton_is_mirror_symmetric():
+    edges = {tuple(sorted(edge)) for edge in APOLLOCAR3D_66.skeleton}
+    mirrored = {tuple(sorted((APOLLOCAR3D_66.flip[a], APOLLOCAR3D_66.flip[b]))) for a, b in edges}
+    assert mirrored == edges
+
+
+def test_facts_agree_with_the_published_list():
+    path = SHARED_DATA / "apollocar3d66.json"
+    if not path.exists():
+        pytest.skip(f"the published keypoint list is not beside the project ({path})")
+    facts = json.loads(path.read_text())
+    assert list(APOLLOCAR3D_66.keypoints) == facts["names"]
+    assert list(APOLLOCAR3D_66.flip) == facts["flip"]
+    assert [i for i, side in enumerate(facts["side"]) if side == "left"] == sorted(APOLLOCAR3D_66.left)
+
+
+def test_wheels_are_wheel_centres():
+    names = [APOLLOCAR3D_66.keypoints[i] for i in APOLLOCAR3D_66.wheels]
+    assert names == ["center_left_front_wheel", "center_right_front_wheel", "center_left_rear_wheel", "center_right_rear_wheel"]
+
+
+@pytest.mark.parametrize("flip", [(0, 1, 2), (1, 2, 0, 3), (0, 1, 2, 9)])
+def test_schemas_that_do_not_pair_up_are_refused(flip):
+    with pytest.raises(KroncError, match="flip"):
+        KeypointSchema("x", ("a", "b", "c", "d"), flip)
+
+
+def test_fewer_than_four_points_are_refused():
+    with pytest.raises(KroncError, match="at least 4"):
+        KeypointSchema("x", ("a", "b", "c"), (0, 1, 2))

@@ -1,0 +1,292 @@
+"""`kronc-process-data`: from photos, scene folders and videos to a dataset nerfstudio trains on, or one clear line."""
+
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from kronc_ns.config import SolverOptions
+from kronc_ns.evaluate import evaluate_poses
+from kronc_ns.export import MARKER
+from kronc_ns.keypoints.io import read_keypoints
+from kronc_ns.plugin import process_data
+from kronc_ns.plugin.process_data import KroncToNerfstudio
+from kronc_ns.scene import load_scene, read_poses
+from kronc_ns.synthetic.folder import write_capture
+from kronc_ns.synthetic.scenes import Capture, make_capture
+
+VIEWS = 12
+FAST = "adam:\n  steps: 300\n  learning_rate: 0.05\n"
+HASTY = "adam:\n  steps: 3\n"  # too little for anything
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Tiny tensors on a busy machine: threads only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return make_capture("walk", views=VIEWS, seed=3)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> SolverOptions:
+    (tmp_path / "fast.yaml").write_text(FAST)
+    return SolverOptions(config=str(tmp_path / "fast.yaml"))
+
+
+@pytest.fixture
+def scene(tmp_path: Path, capture: Capture) -> Path:
+    """Scene folder with the true poses given, photos IMG_1 ... IMG_12, masks and a reference."""
+    folder = tmp_path / "scene"
+    write_capture(folder, capture, start=capture.c2w)
+    for file in ("transforms.json", "reference.json", "keypoints.json"):
+        content = json.loads((folder / file).read_text())
+        for i, frame in enumerate(content["frames"], start=1):
+            frame["file_path"] = f"images/IMG_{i}.jpg"
+            if file == "transforms.json":
+                frame["mask_path"] = f"masks/IMG_{i}.png"
+        (folder / file).write_text(json.dumps(content))
+    for i in range(1, VIEWS + 1):
+        _picture(folder / f"images/IMG_{i}.jpg", i)
+        mask = np.zeros((270, 480), dtype=np.uint8)
+        mask[60:, 100:380] = 255
+        (folder / "masks").mkdir(exist_ok=True)
+        Image.fromarray(mask).save(folder / f"masks/IMG_{i}.png")
+    return folder
+
+
+def _picture(path: Path, seed: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    coarse = np.random.default_rng(seed).integers(0, 255, (27, 48, 3), dtype=np.uint8)
+    Image.fromarray(coarse).resize((480, 270), Image.Resampling.BICUBIC).save(path)
+
+
+def _status(command: KroncToNerfstudio) -> int:
+    try:
+        command.main()
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else -1
+    return 0
+
+
+def _write_openpifpaf(folder: Path, capture: Capture, names: list[str]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, rows in zip(names, capture.keypoints, strict=True):
+        shifted = torch.where(rows[:, 2:] > 0, rows - torch.tensor([0.5, 0.5, 0.0]), 0.0)
+        text = json.dumps([{"keypoints": shifted.flatten().tolist()}])
+        (folder / f"{name}.predictions.json").write_text(text)
+
+
+def test_scene_folder_to_dataset(
+    scene: Path, tmp_path: Path, config: SolverOptions, capture: Capture, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "out"
+    assert _status(KroncToNerfstudio(data=scene, output_dir=out, solve=config)) == 0
+    printed = capsys.readouterr()
+    assert "12 of 12" in printed.out
+    assert "400.0 px: transforms.json" in printed.out
+    assert f"ns-train nerfacto --data {out}" in printed.out
+    assert "Traceback" not in printed.err
+
+    errors = evaluate_poses(read_poses(out / "transforms.json"), read_poses(out / "reference.json")).as_dict()
+    assert errors["registered"] == VIEWS
+    assert errors["rotation_deg"]["max"] < 1.0
+    assert not (out / MARKER).exists()
+    assert json.loads((out / "kronc.json").read_text())["status"] == "converged"
+    content = json.loads((out / "transforms.json").read_text())
+    assert content["frames"][0]["file_path"] == "images/frame_00001.jpg"
+    for frame in content["frames"]:
+        for path in (frame["file_path"], frame["mask_path"]):
+            folder, name = path.split("/")
+            assert (out / path).is_file()
+            assert (out / f"{folder}_2" / name).is_file()
+    found = read_keypoints(out)
+    expected = capture.keypoints.numpy()
+    got = np.stack([found.frames[f"images/frame_{i + 1:05d}.jpg"][0] for i in range(VIEWS)])
+    assert np.abs(got - expected).max() < 1e-3
+
+
+@pytest.mark.nerfstudio
+def test_nerfstudio_reads_the_dataset(scene: Path, tmp_path: Path, config: SolverOptions):
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    out = tmp_path / "out"
+    assert _status(KroncToNerfstudio(data=scene, output_dir=out, solve=config)) == 0
+    for factor in (1, 2):
+        parser = NerfstudioDataParserConfig(data=out, downscale_factor=factor, eval_mode="all").setup()
+        outputs = parser.get_dataparser_outputs("train")
+        assert len(outputs.image_filenames) == VIEWS
+        assert outputs.mask_filenames is not None
+        for image, mask in zip(outputs.image_filenames, outputs.mask_filenames, strict=True):
+            width, height = int(outputs.cameras.width[0]), int(outputs.cameras.height[0])
+            assert Image.open(image).size == Image.open(mask).size == (width, height)
+        assert float(outputs.cameras.fx[0]) == pytest.approx(400 / factor)
+        assert float(outputs.cameras.cx[0]) == pytest.approx(240 / factor)
+
+
+def test_given_poses_survive_an_interruption(
+    scene: Path,
+    tmp_path: Path,
+    config: SolverOptions,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    out = tmp_path / "out"
+    command = KroncToNerfstudio(data=scene, output_dir=out, solve=config)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(process_data, "solve_scene", interrupt)
+        assert _status(command) == 130
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert (out / MARKER).exists()
+    assert load_scene(out).given_c2w is not None
+    assert _status(command) == 0
+    assert "as an earlier run left them" in capsys.readouterr().out
+
+
+def test_photos_without_keypoints_say_how_to_go_on(
+    scene: Path, tmp_path: Path, config: SolverOptions, capture: Capture, capsys: pytest.CaptureFixture[str]
+):
+    photos, out = scene / "images", tmp_path / "out"
+    options = {"data": photos, "output_dir": out, "focal_length_px": 400.0, "solve": config}
+    assert _status(KroncToNerfstudio(**options)) == 2
+    err = capsys.readouterr().err.strip()
+    assert len(err.splitlines()) == 1
+    assert err.startswith("error: 12 frames are ready in")
+    assert f"--keypoints {out / 'images'}" in err
+    assert (out / MARKER).exists()
+    content = json.loads((out / "transforms.json").read_text())
+    assert content["fl_x"] == 400.0
+    assert "transform_matrix" not in content["frames"][0]
+
+    _write_openpifpaf(out / "images", capture, [f"frame_{i:05d}.jpg" for i in range(1, VIEWS + 1)])
+    written = (out / "images/frame_00001.jpg").stat().st_mtime_ns
+    assert _status(KroncToNerfstudio(keypoints=out / "images", **options)) == 0
+    assert "as an earlier run left them" in capsys.readouterr().out
+    assert (out / "images/frame_00001.jpg").stat().st_mtime_ns == written
+    assert (out / "images/frame_00001.jpg.predictions.json").exists()
+    assert load_scene(out).visibility.sum() == capture.keypoints[..., 2].sum()
+
+    assert _status(KroncToNerfstudio(**options)) == 2
+    assert "is solved already: give --keypoints" in capsys.readouterr().err
+    assert (out / "kronc.json").exists()
+
+
+def test_keypoints_may_use_the_names_of_the_photos(
+    scene: Path, tmp_path: Path, config: SolverOptions, capture: Capture
+):
+    out, found = tmp_path / "out", tmp_path / "pifpaf"
+    _write_openpifpaf(found, capture, [f"IMG_{i}.jpg" for i in range(1, VIEWS + 1)])
+    command = KroncToNerfstudio(
+        data=scene / "images",
+        output_dir=out,
+        keypoints=found,
+        masks=scene / "masks",
+        focal_length_px=400.0,
+        solve=config,
+    )
+    assert _status(command) == 0
+    assert (load_scene(out).keypoints - capture.keypoints).abs().max() < 2e-3
+    assert load_scene(out).masks is not None
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
+def test_video_in_two_runs(
+    scene: Path, tmp_path: Path, config: SolverOptions, capture: Capture, capsys: pytest.CaptureFixture[str]
+):
+    video, out = tmp_path / "walk.mp4", tmp_path / "out"
+    command = ["ffmpeg", "-v", "error", "-framerate", "6", "-i", str(scene / "images" / "IMG_%d.jpg"), str(video)]
+    subprocess.run(command, check=True)
+    options = {"data": video, "output_dir": out, "fps": 6.0, "solve": config}
+    assert _status(KroncToNerfstudio(**options)) == 2
+    err = capsys.readouterr().err.splitlines()
+    assert err[0].startswith("warning: focal length 377 px is an assumed field of view of 65 deg")
+    assert err[1].startswith("error: 12 frames are ready")
+    assert len(list((out / "images").iterdir())) == VIEWS
+    _write_openpifpaf(tmp_path / "pifpaf", capture, [f"frame_{i:05d}.png" for i in range(1, VIEWS + 1)])
+    assert _status(KroncToNerfstudio(keypoints=tmp_path / "pifpaf", **options)) in (0, 3)  # 377 px, in truth 400
+    assert "as an earlier run left them" in capsys.readouterr().out
+    assert (out / "kronc.json").exists()
+
+
+def test_a_doubtful_solution_is_written_and_ends_with_3(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "out"
+    (tmp_path / "hasty.yaml").write_text(HASTY)
+    solver = SolverOptions(config=str(tmp_path / "hasty.yaml"), init="circular")
+    assert _status(KroncToNerfstudio(data=scene, output_dir=out, solve=solver)) == 3
+    printed = capsys.readouterr()
+    assert printed.err.startswith("failed: ")
+    assert len(printed.err.strip().splitlines()) == 1
+    assert "ns-train" not in printed.out
+    assert json.loads((out / "kronc.json").read_text())["status"] == "failed"
+    assert not (out / MARKER).exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"data": Path("nowhere")}, "nowhere does not exist: expected a scene folder"),
+        ({"fps": 0.0}, "--fps is 0: expected a number above 0"),
+        ({"num_frames_target": 2}, "--num-frames-target is 2: expected at least 3"),
+        ({"num_downscales": -1}, "--num-downscales is -1"),
+        ({"masks": Path("nowhere")}, "--masks nowhere is no folder"),
+        ({"keypoints": Path("nowhere.json")}, "nowhere.json does not exist: expected our keypoints.json"),
+        ({"focal_length_px": -3.0}, "focal length (-3, -3) px is not positive"),
+        ({"solve": SolverOptions(config="nowhere")}, "there is no preset 'nowhere'"),
+    ],
+)
+def test_what_the_user_can_mend_is_one_line_and_leaves_no_output(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict, message: str
+):
+    out = tmp_path / "out"
+    assert _status(KroncToNerfstudio(**{"data": scene, "output_dir": out, **change})) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert len(err) == 1
+    assert err[0].startswith("error: ")
+    assert message in err[0]
+    assert not out.exists()
+
+
+def test_folders_that_are_not_ours_stay_as_they_are(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for out in (scene, scene.parent):
+        assert _status(KroncToNerfstudio(data=scene, output_dir=out)) == 2
+        assert "choose another output folder" in capsys.readouterr().err
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "mine.txt").write_text("mine")
+    assert _status(KroncToNerfstudio(data=scene, output_dir=other)) == 2
+    assert "did not write" in capsys.readouterr().err
+    assert [file.name for file in other.iterdir()] == ["mine.txt"]
+
+
+def test_a_scene_folder_needs_keypoints(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (scene / "keypoints.json").unlink()
+    assert _status(KroncToNerfstudio(data=scene, output_dir=tmp_path / "out")) == 2
+    assert "has no keypoints.json: give --keypoints" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_help_names_every_option(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sys.argv", ["kronc-process-data", "--help"])
+    with pytest.raises(SystemExit):
+        process_data.main()
+    text = capsys.readouterr().out
+    for option in ("data", "output-dir", "keypoints", "masks", "fps", "num-frames-target", "focal-length-px", "config"):
+        assert f"--{option} " in text

@@ -1,0 +1,190 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kronc_ns.errors import KroncError
+from kronc_ns.geometry.alignment import pose_errors
+from kronc_ns.init import noisy_poses
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66
+from kronc_ns.pipeline import KroncConfig, car_axes, fingerprint, residuals_px, solve_scene
+from kronc_ns.geometry.rotations import so3_exp
+from kronc_ns.scene import Scene, load_scene
+from kronc_ns.solve.adam import AdamConfig
+from kronc_ns.solve.solution import Status, ViewStatus
+from kronc_ns.synthetic.scenes import make_capture
+from tests.conftest import scene_of
+
+QUICK = KroncConfig(adam=AdamConfig(steps=1500))
+
+
+@pytest.fixture(scope="module")
+def noisy(walk_capture) -> Scene:
+    return scene_of(walk_capture, noisy_poses(walk_capture.c2w, 4.0, 0.5, torch.Generator().manual_seed(0)))
+
+
+def test_solving_from_noisy_poses(noisy, walk_capture):
+    solution = solve_scene(noisy, QUICK)
+    assert solution.status is Status.CONVERGED
+    assert all(view.status is ViewStatus.SOLVED for view in solution.views)
+    before, _ = pose_errors(noisy.given_c2w, walk_capture.c2w)
+    rotation, translation = pose_errors(solution.c2w, walk_capture.c2w)
+    assert before.median() > 4.0
+    assert rotation.median() < 0.6
+    assert translation.median() < 0.06
+    assert 0.2 < solution.rmse_px < 1.0  # half a pixel of noise per axis
+    # given poses keep their world: the solution is not only right up to a similarity
+    assert (solution.c2w[..., 3] - walk_capture.c2w[..., 3]).norm(dim=-1).median() < 0.4
+
+
+def test_solving_from_the_circle_stands_the_car_upright(walk_capture):
+    solution = solve_scene(scene_of(walk_capture), KroncConfig(radius_m=5.0, adam=AdamConfig(steps=4000)))
+    assert solution.init == "circular"
+    assert solution.status is Status.CONVERGED
+    points, truth = solution.points, torch.from_numpy(walk_capture.car.keypoints)
+    known = points.isfinite().all(-1)
+    scale = torch.linalg.lstsq(points[known].flatten()[:, None], (truth[known] - truth[known].mean(0)).flatten()).solution
+    centred = points[known] - points[known].mean(0)
+    error = (scale * centred - (truth[known] - truth[known].mean(0))).norm(dim=-1)
+    assert error.median() < 0.05, "x forward, y left, z up, as the car really stands"
+    distance = (solution.c2w[..., 3]).norm(dim=-1).mean()
+    assert float(distance) == pytest.approx(5.0, rel=0.02)
+
+
+def test_the_wrong_direction_is_not_called_converged(walk_capture):
+    wrong = KroncConfig(direction="cw", adam=AdamConfig(steps=2000))
+    solution = solve_scene(scene_of(walk_capture), wrong)
+    assert solution.status is not Status.CONVERGED
+    assert "other way" in solution.reason
+
+
+def test_a_poor_view_is_left_out_and_the_others_do_not_suffer(noisy, walk_capture):
+    keypoints = noisy.keypoints.clone()
+    keypoints[5, torch.nonzero(keypoints[5, :, 2])[3:, 0]] = 0  # three points left
+    solution = solve_scene(replace(noisy, keypoints=keypoints), QUICK)
+    assert solution.views[5].status is ViewStatus.FAILED
+    assert solution.views[5].reason == "3 keypoints, at least 4 are needed"
+    assert solution.c2w[5].isnan().all()
+    kept = torch.tensor(solution.solved)
+    assert int(kept.sum()) == 15
+    assert pose_errors(solution.c2w[kept], walk_capture.c2w[kept])[0].median() < 0.6
+
+
+def test_a_view_of_another_car_is_found_out(noisy):
+    keypoints = noisy.keypoints.clone()
+    seen = torch.nonzero(keypoints[5, :, 2])[:, 0]
+    shuffled = seen[torch.randperm(len(seen), generator=torch.Generator().manual_seed(0))]
+    keypoints[5, seen, :2] = keypoints[5, shuffled, :2]
+    solution = solve_scene(replace(noisy, keypoints=keypoints), QUICK)
+    assert solution.views[5].status is ViewStatus.FAILED
+    assert "agree" in solution.views[5].reason
+
+
+def test_same_seed_same_bits_and_the_seed_matters(noisy):
+    short = KroncConfig(adam=AdamConfig(steps=30))
+    first, second = solve_scene(noisy, short), solve_scene(noisy, short)
+    assert torch.equal(first.c2w, second.c2w)
+    assert not torch.equal(first.c2w, solve_scene(noisy, replace(short, seed=1)).c2w)
+
+
+def test_given_depths_speed_up_and_can_be_fixed(noisy, walk_capture):
+    from kronc_ns.geometry.poses import invert, transform
+
+    world = torch.from_numpy(walk_capture.car.keypoints).expand(16, -1, -1)
+    scene = replace(noisy, given_depths=transform(invert(walk_capture.c2w), world)[..., 2])
+    few = AdamConfig(steps=300)
+    prior = solve_scene(scene, KroncConfig(depth_init="prior", adam=few))
+    random = solve_scene(scene, KroncConfig(depth_init="random", adam=few))
+    error = [pose_errors(s.c2w, walk_capture.c2w)[1].median() for s in (prior, random)]
+    assert error[0] < error[1]
+    fixed = solve_scene(scene, KroncConfig(depth_init="prior-fixed", adam=few))
+    ratio = (fixed.depths / scene.given_depths)[fixed.depths.isfinite()]
+    torch.testing.assert_close(ratio, ratio[0].expand_as(ratio), rtol=1e-5, atol=0)  # one scale for all
+
+
+def test_residuals_are_infinite_behind_a_camera(noisy, walk_capture):
+    solution = solve_scene(noisy, KroncConfig(adam=AdamConfig(steps=10)))
+    behind = walk_capture.c2w.clone()
+    behind[0, :, [0, 2]] *= -1  # turned away from the car
+    truth = torch.from_numpy(walk_capture.car.keypoints)
+    error = residuals_px(noisy, replace(solution, c2w=behind, points=truth))
+    seen = noisy.visibility[0] > 0
+    assert error[0, seen].isinf().all()
+    assert error[0, ~seen].isnan().all()
+    assert error[1][error[1].isfinite()].median() < 1.0
+
+
+@pytest.mark.parametrize("views", [[], [0], [0, 4]])
+def test_fewer_than_three_usable_views_are_refused(noisy, views):
+    keypoints = torch.zeros_like(noisy.keypoints)
+    keypoints[views] = noisy.keypoints[views]
+    with pytest.raises(KroncError, match=f"^{len(views)} of 16 views"):
+        solve_scene(replace(noisy, keypoints=keypoints), QUICK)
+
+
+def test_views_without_overlap_are_refused(noisy):
+    keypoints = noisy.keypoints.clone()
+    keypoints[..., 2] = 0
+    for view in range(3):
+        keypoints[view, 5 * view : 5 * view + 5] = torch.tensor([10.0, 20.0, 1.0], dtype=torch.float64)
+    with pytest.raises(KroncError, match="do not overlap"):
+        solve_scene(replace(noisy, keypoints=keypoints), QUICK)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (KroncConfig(init="given"), "transform_matrix"),
+        (KroncConfig(depth_init="prior"), "depth_file_path"),
+        (KroncConfig(device="cuda"), "CUDA"),
+    ],
+)
+def test_what_the_scene_lacks_is_named(walk_capture, config, message):
+    if config.device == "cuda" and torch.cuda.is_available():
+        pytest.skip("this machine has a CUDA GPU")
+    with pytest.raises(KroncError, match=message):
+        solve_scene(scene_of(walk_capture), config)
+
+
+def test_impossible_options_are_refused():
+    for change in ({"radius_m": 0.0}, {"laps": -1.0}, {"adam": AdamConfig(steps=0)}, {"adam": AdamConfig(learning_rate=math.nan)}):
+        with pytest.raises(KroncError):
+            KroncConfig(**change)
+    with pytest.raises(KroncError, match="not both be 0"):
+        KroncConfig(adam=AdamConfig(weight_2d=0.0, weight_3d=0.0))
+
+
+def test_car_axes_follow_the_car():
+    capture = make_capture("walk", views=2)
+    points = torch.from_numpy(capture.car.keypoints)
+    rotation = so3_exp(torch.tensor([0.4, -0.8, 1.9], dtype=torch.float64))
+    turned = points @ rotation.T
+    turned[[1, 7, 30]] = math.nan
+    axes = car_axes(APOLLOCAR3D_66, turned, rotation @ torch.tensor([0.1, 0.0, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(axes @ rotation, torch.eye(3, dtype=torch.float64), atol=1e-3, rtol=0)
+
+
+def test_fingerprint_knows_contents_and_options_but_no_paths(noisy):
+    same = replace(noisy, names=tuple(f"elsewhere/{name.split('/')[-1]}" for name in noisy.names))
+    assert fingerprint(noisy, QUICK) == fingerprint(same, QUICK)
+    assert fingerprint(noisy, QUICK) == fingerprint(noisy, replace(QUICK, device="cpu"))
+    assert fingerprint(noisy, QUICK) != fingerprint(noisy, replace(QUICK, seed=1))
+    keypoints = noisy.keypoints.clone()
+    keypoints[0, 0, 0] += 1e-6
+    assert fingerprint(noisy, QUICK) != fingerprint(replace(noisy, keypoints=keypoints), QUICK)
+
+
+@pytest.mark.slow
+def test_real_photos_from_the_circle_alone(spin_suv):
+    from kronc_ns.config import load_config
+    from kronc_ns.scene import read_poses
+
+    scene = load_scene(spin_suv)
+    solution = solve_scene(scene, load_config("turntable"))
+    reference = read_poses(spin_suv / "reference.json")
+    assert solution.status is Status.CONVERGED
+    assert all(solution.solved)
+    rotation, translation = pose_errors(solution.c2w, torch.stack([reference[name] for name in scene.names]))
+    assert rotation.median() <= 0.6
+    assert translation.median() <= 0.10
