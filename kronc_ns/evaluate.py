@@ -44,7 +44,7 @@ class PoseErrors:
             "registered": self.registered,
             "rotation_deg": _summary(self.rotation_deg),
             "translation": _summary(self.translation),
-            **{f"auc_{limit}deg": self.auc(limit) for limit in AUC_LIMITS_DEG},
+            **{f"auc_{limit}deg": self.auc(float(limit)) for limit in AUC_LIMITS_DEG},
         }
 
 
