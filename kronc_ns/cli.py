@@ -1,6 +1,7 @@
 """The `kronc` command."""
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kronc_ns.config import SolverOptions
-from kronc_ns.console import exit_on_error, exit_status, progress_bar, solution_table
+from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
 from kronc_ns.errors import KroncError
 from kronc_ns.evaluate import evaluate_poses
 from kronc_ns.export import claim_output, write_colmap, write_ply, write_solution
@@ -42,10 +43,10 @@ class Solve(SolverOptions):
         claim_output(self.output_dir)
         with progress_bar("solving") as progress:
             solution = solve_scene(scene, config, progress)
-        write_solution(self.output_dir, scene, solution, self.data, fingerprint(scene, config))
-        Console().print(solution_table(solution, scene.notes))
+        report = write_solution(self.output_dir, scene, solution, self.data, fingerprint(scene, config))
+        Console().print(report_table(report, scene.notes))
         print(f"{self.output_dir / 'transforms.json'}")
-        return exit_status(solution)
+        return exit_status(report)
 
 
 @dataclass(kw_only=True)
@@ -106,10 +107,12 @@ class Synth:
         for name, share in shares.items():
             if not 0 <= share < 1:
                 raise KroncError(f"{name} is {share}: expected a share from 0 to below 1")
+        noises = {"--noise-px": self.noise_px, "--pose-noise-deg": self.pose_noise_deg, "--pose-noise-m": self.pose_noise_m}
+        for name, noise in noises.items():
+            if not 0 <= noise < math.inf:
+                raise KroncError(f"{name} is {noise}: expected a standard deviation, 0 or more")
         if self.views < 1 or (self.width is not None and self.width < 16):
             raise KroncError(f"--views {self.views} --width {self.width}: expected at least 1 view of at least 16 pixels")
-        if min(self.noise_px, self.pose_noise_deg, self.pose_noise_m) < 0:
-            raise KroncError("--noise-px, --pose-noise-deg and --pose-noise-m must not be negative")
         camera = default_camera(self.preset, self.width)
         capture = make_capture(
             self.preset, self.views, self.seed, self.noise_px, self.missing, self.outliers, camera

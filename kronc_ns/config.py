@@ -89,7 +89,10 @@ def _update(target: Any, content: Any, where: str) -> Any:
         changes[key] = (
             _update(current, value, f"{where}, {key}") if is_dataclass(current) else _check(value, hints[key], f"{where}, {key}")
         )
-    return replace(target, **changes)
+    try:
+        return replace(target, **changes)
+    except KroncError as error:  # a value of the right kind that cannot be
+        raise KroncError(f"{where}: {error}") from None
 
 
 def _check(value: Any, kind: Any, where: str) -> Any:
@@ -97,8 +100,11 @@ def _check(value: Any, kind: Any, where: str) -> Any:
         if value not in get_args(kind):
             raise KroncError(f"{where}: {value!r} is not allowed: expected one of {', '.join(map(str, get_args(kind)))}")
         return value
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+    if kind is float and not isinstance(value, bool):
+        try:
+            return float(value)  # also of text: YAML takes 1e-3 for a string
+        except (TypeError, ValueError):
+            pass
     if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
         raise KroncError(f"{where}: {value!r} is not of the right kind: expected {kind.__name__}")
     return value

@@ -3,7 +3,7 @@
 import errno
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,8 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from kronc_ns.errors import KroncError
-from kronc_ns.export import solution_dict
-from kronc_ns.solve.solution import Solution, Status, ViewStatus
+from kronc_ns.solve.solution import Status, ViewStatus
 
 _LISTED = 8  # failed views named in the table
 
@@ -33,9 +32,10 @@ def exit_on_error() -> Iterator[None]:
         raise
 
 
-def exit_status(solution: Solution) -> int:
-    """0 for a trustworthy solution, else 3 with the reason on stderr."""
-    return 0 if solution.status is Status.CONVERGED else _fail(f"{solution.status.value}: {solution.reason}", 3)
+def exit_status(report: Mapping[str, Any]) -> int:
+    """0 for a trustworthy solution (kronc.json's content), else 3 with the reason on stderr."""
+    trusted = report["status"] == Status.CONVERGED.value
+    return 0 if trusted else _fail(f"{report['status']}: {report['reason']}", 3)
 
 
 def _fail(message: str, status: int) -> int:
@@ -64,8 +64,8 @@ def progress_bar(description: str) -> Iterator[Callable[[int, int, float | None]
         yield advance
 
 
-def report_table(report: dict[str, Any]) -> Table:
-    """Summary of a solution from its kronc.json content: views solved and failed (with reasons), residuals, time."""
+def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> Table:
+    """Summary of kronc.json's content: views solved and failed (with reasons), residuals, time, ``notes``."""
     views = report["views"]
     solved = sum(view["status"] == ViewStatus.SOLVED.value for view in views)
     failed = [view for view in views if view["status"] == ViewStatus.FAILED.value]
@@ -80,12 +80,6 @@ def report_table(report: dict[str, Any]) -> Table:
     table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {median:.2f} px of all")
     table.add_row("solver", f"{report['solver']} from {report['init']} poses, {report['iterations']} steps")
     table.add_row("time", f"{report['seconds']:.2f} s ({rate:.0f} steps/s)")
-    return table
-
-
-def solution_table(solution: Solution, notes: tuple[str, ...] = ()) -> Table:
-    """`report_table` of a solution, with what loading the scene decided."""
-    table = report_table(solution_dict(solution))
     for note in notes:
         table.add_row("note", note)
     return table

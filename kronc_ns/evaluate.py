@@ -78,4 +78,4 @@ def _by_file_name(poses: Mapping[str, Float[Tensor, "3 4"]], what: str) -> dict[
 
 
 def _summary(errors: Float[Tensor, "n"]) -> dict[str, float]:
-    return {"mean": float(errors.mean()), "median": float(errors.median()), "max": float(errors.max())}
+    return {"mean": float(errors.mean()), "median": float(errors.quantile(0.5)), "max": float(errors.max())}

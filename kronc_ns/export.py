@@ -24,7 +24,7 @@ from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import flip_camera_axes, invert
 from kronc_ns.keypoints.io import read_json
 from kronc_ns.scene import Scene, camera_and_frames, read_poses
-from kronc_ns.solve.solution import Solution, ViewStatus
+from kronc_ns.solve.solution import Solution
 
 MARKER = ".kronc-incomplete"
 """Present in an output folder from the first byte until kronc.json is written."""
@@ -90,11 +90,11 @@ def transforms_dict(
     return content
 
 
-def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, inputs: str) -> None:
+def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, inputs: str) -> dict[str, Any]:
     """Write transforms.json, kronc.json and the keypoint cloud of a claimed ``folder``, and release it.
 
     ``data`` is the folder that ``scene`` was read from (image paths are written relative to ``folder``);
-    ``inputs`` is the `fingerprint` of what was solved.
+    ``inputs`` is the `fingerprint` of what was solved. Returns the content of kronc.json.
     """
     names = [_relative(data, name, folder) for name in solution.names]
     masks = [_relative(data, mask, folder) for mask in scene.masks] if scene.masks else None
@@ -104,8 +104,10 @@ def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, i
     with atomic_path(folder / "keypoints.ply") as path:
         trimesh.PointCloud(known.numpy(), colors=np.tile([[200, 40, 40, 255]], (len(known), 1))).export(path)
     write_json(folder / "transforms.json", content)
-    write_json(folder / "kronc.json", {**solution_dict(solution), "keypoint_schema": scene.schema.name, "inputs": inputs})
+    report = {**solution_dict(solution), "keypoint_schema": scene.schema.name, "inputs": inputs}
+    write_json(folder / "kronc.json", report)
     release_output(folder)
+    return report
 
 
 def solution_dict(solution: Solution) -> dict[str, Any]:
@@ -150,7 +152,7 @@ def write_colmap(folder: Path, solved: Path) -> int:
     transforms = solved / "transforms.json"
     camera, frames = camera_and_frames(read_json(transforms), transforms)
     poses = read_poses(transforms)
-    report = read_json(solved / "kronc.json")
+    points = _solved_points(solved)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(
@@ -165,26 +167,32 @@ def write_colmap(folder: Path, solved: Path) -> int:
         w2c = invert(poses[frame["file_path"]])
         image = pycolmap.Image(name=Path(frame["file_path"]).name, camera_id=1, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(w2c.numpy()))
-    for point in report["points"]:
-        if None not in point:
-            model.add_point3D(np.array(point), pycolmap.Track(), np.array([200, 40, 40], dtype=np.uint8))
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(str(folder))
+    for point in points:
+        model.add_point3D(point, pycolmap.Track(), np.array([200, 40, 40], dtype=np.uint8))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        model.write_binary(str(folder))
+    except (OSError, ValueError) as error:  # ValueError: pycolmap could not open or write a file
+        raise KroncError(f"{folder} cannot be written: {getattr(error, 'strerror', None) or error}") from None
     return len(frames)
 
 
 def write_ply(path: Path, solved: Path) -> int:
     """Write camera centres (blue) and keypoints (red) of a solved folder as a point cloud; returns their number."""
     poses = read_poses(solved / "transforms.json")
-    points = [point for point in read_json(solved / "kronc.json")["points"] if None not in point]
+    points = _solved_points(solved)
     centres = torch.stack(list(poses.values()))[..., 3].numpy()
-    cloud = np.concatenate([centres, np.array(points).reshape(-1, 3)])
+    cloud = np.concatenate([centres, points])
     colours = np.array([[40, 80, 200, 255]] * len(centres) + [[200, 40, 40, 255]] * len(points), dtype=np.uint8)
     with atomic_path(path) as temporary:
         trimesh.PointCloud(cloud, colors=colours).export(temporary, file_type="ply")
     return len(cloud)
 
 
-def solved_names(report: dict[str, Any]) -> set[str]:
-    """``file_path`` of the views of a kronc.json that have a pose."""
-    return {view["file_path"] for view in report["views"] if view["status"] != ViewStatus.FAILED.value}
+def _solved_points(solved: Path) -> Float[np.ndarray, "j 3"]:
+    """The keypoints of a kronc.json that were solved."""
+    file = solved / "kronc.json"
+    try:
+        return np.array([point for point in read_json(file)["points"] if None not in point], dtype=float).reshape(-1, 3)
+    except (KeyError, TypeError, ValueError):
+        raise KroncError(f'{file}: expected "points", as `kronc solve` writes them: solve again') from None

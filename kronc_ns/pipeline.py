@@ -7,11 +7,12 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import PurePosixPath
-from typing import Literal, assert_never
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from typing_extensions import assert_never
 
 from kronc_ns import objective
 from kronc_ns.errors import KroncError
@@ -65,8 +66,8 @@ class KroncConfig:
             "adam.learning_rate": self.adam.learning_rate,
         }
         for name, value in positive.items():
-            if not value > 0:
-                raise KroncError(f"{name} is {value}: expected a number above 0")
+            if not 0 < value < math.inf:
+                raise KroncError(f"{name} is {value}: expected a finite number above 0")
         if min(self.adam.weight_2d, self.adam.weight_3d) < 0 or self.adam.weight_2d + self.adam.weight_3d <= 0:
             raise KroncError("adam.weight_2d and adam.weight_3d must not be negative, and not both be 0")
 

@@ -13,8 +13,8 @@ LAYERS = [
     {"scene"},
     {"init", "objective", "solve"},
     {"pipeline"},
-    {"config", "evaluate", "benchmark", "capture", "export", "report", "plots", "viewer"},
-    {"synthetic", "console"},
+    {"config", "evaluate", "capture", "export", "report", "plots", "viewer"},
+    {"synthetic", "console", "benchmark"},
     {"cli", "plugin"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -72,6 +72,22 @@ def check_source(source: Source) -> tuple[int, int] | None:
     return first
 
 
+def find_frames(
+    source: Source, out: Path, fps: float = 5.0, num_frames_target: int | None = None, num_downscales: int = 3
+) -> Frames | None:
+    """The frames that an earlier `prepare_frames` with the same arguments left in ``out``, if they are all there."""
+    try:
+        content = read_json(out / RECORD)
+        width, height = content["size"]
+        names, factors = tuple(content["names"]), tuple(content["factors"])
+        frames = Frames(names, tuple(content["source_names"]), (width, height), factors, reused=True)
+        same = content["source"] == _signature(source, fps, num_frames_target, num_downscales)
+    except (KroncError, KeyError, TypeError, ValueError):
+        return None
+    paths = [level_path(out / name, factor) for name in names for factor in (1, *factors)]
+    return frames if same and all(path.is_file() for path in paths) else None
+
+
 def prepare_frames(
     source: Source,
     out: Path,
@@ -81,15 +97,12 @@ def prepare_frames(
     keep: Sequence[Path] = (),
     progress: Count | None = None,
 ) -> Frames:
-    """Extract or copy the frames of ``source`` into ``out`` with downscaled copies, or find them there already.
+    """Extract or copy the frames of ``source`` into ``out`` with downscaled copies.
 
     Photos are turned upright as their EXIF says; images of a scene folder are copied as they are stored, since
     its transforms.json speaks of those pixels. Frames of an earlier run are removed first, but nothing in ``keep``.
     """
     signature = _signature(source, fps, num_frames_target, num_downscales)
-    found = _recorded(out, signature)
-    if found is not None:
-        return found
     (out / RECORD).unlink(missing_ok=True)
     _clear(out, keep)
     (out / "images").mkdir(exist_ok=True)
@@ -176,18 +189,6 @@ def _signature(source: Source, *settings: float | int | None) -> str:
     states = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     text = json.dumps([states, source.names, source.camera is None, settings])
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _recorded(out: Path, signature: str) -> Frames | None:
-    try:
-        content = read_json(out / RECORD)
-        width, height = content["size"]
-        names, factors = tuple(content["names"]), tuple(content["factors"])
-        frames = Frames(names, tuple(content["source_names"]), (width, height), factors, reused=True)
-    except (KroncError, KeyError, TypeError, ValueError):
-        return None
-    paths = [level_path(out / name, factor) for name in names for factor in (1, *factors)]
-    return frames if content["source"] == signature and all(path.is_file() for path in paths) else None
 
 
 def _clear(out: Path, keep: Sequence[Path]) -> None:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -28,8 +29,7 @@ class Source:
     """A capture as it was found; nothing of it is ever written."""
 
     path: Path
-    kind: str
-    """What it is, in words: "scene folder", "photos" or "video"."""
+    kind: Literal["scene folder", "photos", "video"]
     images: tuple[Path, ...]
     """Image files in capture order; empty for a video, whose frames have to be extracted."""
     names: tuple[str, ...]

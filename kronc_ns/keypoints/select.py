@@ -47,12 +47,12 @@ def select_instances(
 
 
 def _boxes(rows: Float[np.ndarray, "m j 3"], size: tuple[int, int]) -> Float[np.ndarray, "m 4"]:
-    """(centre u, centre v, width, height) of each instance's seen points, in image diagonals."""
+    """(centre u, centre v, width, height) of each instance's seen points, in image diagonals; zeros without any."""
     seen = rows[..., 2:] > 0
-    low = np.where(seen, rows[..., :2], np.inf).min(1)
-    high = np.where(seen, rows[..., :2], -np.inf).max(1)
-    box = np.concatenate([(low + high) / 2, high - low], axis=1) / np.hypot(*size)
-    return np.where(np.isfinite(box), box, 0.0)
+    any_seen = seen.any(1)
+    low = np.where(any_seen, np.where(seen, rows[..., :2], np.inf).min(1), 0.0)
+    high = np.where(any_seen, np.where(seen, rows[..., :2], -np.inf).max(1), 0.0)
+    return np.concatenate([(low + high) / 2, high - low], axis=1) / np.hypot(*size)
 
 
 def _score(

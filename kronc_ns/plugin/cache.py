@@ -1,7 +1,6 @@
 """Solutions kept between runs, keyed by the content of what was solved; the user's own folder is never written."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ from kronc_ns.export import claim_output, write_solution
 from kronc_ns.keypoints.io import read_json
 from kronc_ns.pipeline import KroncConfig, Progress, fingerprint, solve_scene
 from kronc_ns.scene import Scene
-from kronc_ns.solve.solution import Solution
 
 
 def cache_folder() -> Path:
@@ -25,11 +23,11 @@ def read_report(folder: Path) -> dict[str, Any] | None:
 
 
 def solve_cached(
-    data: Path, scene: Scene, config: KroncConfig, progress: Progress | None, solved: Callable[[Solution], None]
+    data: Path, scene: Scene, config: KroncConfig, progress: Progress | None
 ) -> Path:
     """Folder with transforms.json and kronc.json for a scene: the cached one, else solved now.
 
-    ``solved`` is called with a solution that was computed here. A cache that cannot be written is an error.
+    A cache that cannot be written is an error.
     """
     inputs = fingerprint(scene, config)
     folder = cache_folder() / inputs[:32]
@@ -39,7 +37,6 @@ def solve_cached(
     solution = solve_scene(scene, config, progress)
     claim_output(folder)
     write_solution(folder, scene, solution, data, inputs)
-    solved(solution)
     return folder
 
 

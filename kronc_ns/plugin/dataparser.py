@@ -4,6 +4,7 @@ This module must not import ``nerfstudio.engine.trainer``, ``nerfstudio.pipeline
 nerfstudio loads dataparsers while those are still being imported.
 """
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -19,14 +20,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from kronc_ns.config import SolverOptions
-from kronc_ns.console import exit_on_error, progress_bar, report_table
+from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.poses import flip_camera_axes
 from kronc_ns.plugin.cache import read_report, solve_cached
 from kronc_ns.plugin.images import cut_out, downscaled
 from kronc_ns.plugin.seeds import seed_points
 from kronc_ns.scene import Scene, load_scene, read_poses
-from kronc_ns.solve.solution import Solution, Status
+from kronc_ns.solve.solution import Status
 
 _BOX_MARGIN = 0.1  # of the car's length: keypoints stop short of tyres, mirrors and the roof
 
@@ -84,19 +85,14 @@ class KroncDataParser(DataParser):
             folder = config.data
         else:
 
-            def log(solution: Solution) -> None:
-                for note in scene.notes:
-                    CONSOLE.print(f"note: {note}")
-                if solution.status is Status.FAILED:
-                    raise KroncError(f"no trustworthy poses: {solution.reason}")
-
             with progress_bar("solving poses") as progress:
-                folder = solve_cached(config.data, scene, config.solver_config(), progress, log)
+                folder = solve_cached(config.data, scene, config.solver_config(), progress)
             report = read_report(folder)
         assert report is not None
+        CONSOLE.print(report_table(report, scene.notes))
+        doubt = exit_status(report)
         if report["status"] == Status.FAILED.value:
-            raise KroncError(f"no trustworthy poses: {report['reason']}")
-        CONSOLE.print(report_table(report))
+            sys.exit(doubt)
         poses = read_poses(folder / "transforms.json")
         return scene, {PurePosixPath(name).name: pose for name, pose in poses.items()}, report
 

@@ -60,8 +60,8 @@ kronc_tensorf_cpu = MethodSpecification(
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
-        steps_per_save=500,
-        max_num_iterations=1500,
+        steps_per_save=400,
+        max_num_iterations=1200,
         mixed_precision=False,
         pipeline=VanillaPipelineConfig(
             datamanager=VanillaDataManagerConfig(
@@ -73,10 +73,10 @@ kronc_tensorf_cpu = MethodSpecification(
                 regularization="l1",
                 camera_optimizer=CameraOptimizerConfig(mode="off"),
                 init_resolution=48,
-                final_resolution=128,
-                upsampling_iters=(300, 600, 900),
-                num_uniform_samples=96,
-                num_samples=24,
+                final_resolution=96,
+                upsampling_iters=(250, 500),
+                num_uniform_samples=48,
+                num_samples=16,
                 num_den_components=8,
                 num_color_components=16,
                 eval_num_rays_per_chunk=4096,
@@ -85,11 +85,11 @@ kronc_tensorf_cpu = MethodSpecification(
         optimizers={
             "fields": {
                 "optimizer": AdamOptimizerConfig(lr=2e-3),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=2e-4, max_steps=1500),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=2e-4, max_steps=1200),
             },
             "encodings": {
                 "optimizer": AdamOptimizerConfig(lr=3e-2),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=3e-3, max_steps=1500),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=3e-3, max_steps=1200),
             },
         },
         viewer=ViewerConfig(quit_on_train_completion=True),

@@ -9,12 +9,12 @@ from typing import Annotated, Union
 import tyro
 from rich.console import Console
 
-from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, prepare_frames
+from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, find_frames, prepare_frames
 from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics
 from kronc_ns.capture.masks import find_masks, write_masks
 from kronc_ns.capture.source import MIN_FRAMES, Source, find_source
 from kronc_ns.config import SolverOptions
-from kronc_ns.console import exit_on_error, exit_status, progress_bar, solution_table
+from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
 from kronc_ns.errors import KroncError
 from kronc_ns.export import claim_output, transforms_dict, write_solution
 from kronc_ns.files import write_json
@@ -68,14 +68,19 @@ class KroncToNerfstudio:
         size = check_source(source)
         found = self._read_keypoints(source)
         early = None if size is None else self._intrinsics(source, size)
-        claim_output(self.output_dir)
-
         out = self.output_dir
-        keep = [path for path in (self.masks, self.keypoints) if path is not None]
-        with progress_bar("frames") as progress:
-            frames = prepare_frames(
-                source, out, self.fps, self.num_frames_target, self.num_downscales, keep=keep, progress=progress
+        settings = (self.fps, self.num_frames_target, self.num_downscales)
+        frames = find_frames(source, out, *settings)
+        if frames is None and self.keypoints is not None and self.keypoints.resolve().is_relative_to(out.resolve()):
+            raise KroncError(
+                f"the frames in {out / 'images'} are not of this command, so the keypoints beside them do not fit: "
+                "repeat the options of the first run, or run without --keypoints and detect anew"
             )
+        claim_output(out)
+        if frames is None:
+            with progress_bar("frames") as progress:
+                keep = [self.masks] if self.masks else []
+                frames = prepare_frames(source, out, *settings, keep=keep, progress=progress)
         intrinsics = early or self._intrinsics(source, frames.size)
         if intrinsics.assumed:
             print(_assumption(intrinsics), file=sys.stderr)
@@ -92,15 +97,15 @@ class KroncToNerfstudio:
         scene = load_scene(out)
         with progress_bar("solving") as progress:
             solution = solve_scene(scene, config, progress)
-        write_solution(out, scene, solution, out, fingerprint(scene, config))
+        report = write_solution(out, scene, solution, out, fingerprint(scene, config))
 
-        table = solution_table(solution, (*scene.notes, *([note] if note else [])))
+        table = report_table(report, (*scene.notes, *([note] if note else [])))
         levels = "".join(f", 1/{factor}" for factor in frames.factors)
         origin = "as an earlier run left them" if frames.reused else f"from {source.kind} {self.data}"
         table.add_row("frames", f"{len(frames.names)} of {frames.size[0]}x{frames.size[1]}{levels}, {origin}")
         table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}")
         Console().print(table)
-        status = exit_status(solution)
+        status = exit_status(report)
         if status == 0:
             print(f"ns-train nerfacto --data {out}")
         return status

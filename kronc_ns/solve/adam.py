@@ -188,6 +188,24 @@ def minimise(
 
     ``uv`` are undistorted pixels, ``m`` the visibility. ``progress(step, loss)`` is called about a hundred times.
     """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the tensors are too small to share; idle threads would only spin for the cores
+    try:
+        return _minimise(c2w, depths, uv, m, focal, principal, config, progress)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _minimise(
+    c2w: Float[Tensor, "n 3 4"],
+    depths: Float[Tensor, "n j"],
+    uv: Float[Tensor, "n j 2"],
+    m: Float[Tensor, "n j"],
+    focal: tuple[float, float],
+    principal: tuple[float, float],
+    config: AdamConfig,
+    progress: Callable[[int, float], None] | None,
+) -> AdamResult:
     start = time.perf_counter()
     gradient = LossGradient(c2w, depths, uv, m, focal, principal, (config.weight_3d, config.weight_2d))
     optimiser = torch.optim.Adam([gradient.parameters], lr=config.learning_rate, fused=True)

@@ -14,7 +14,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from kronc_ns.synthetic.car import METRES_PER_TEXEL, CarModel, mip_levels
+from kronc_ns.synthetic.car import CarModel
+from kronc_ns.synthetic.car_paint import METRES_PER_TEXEL, mip_levels
 
 SUN = np.array([0.45, 0.52, 0.73]) / np.linalg.norm([0.45, 0.52, 0.73])
 """Direction to the sun."""

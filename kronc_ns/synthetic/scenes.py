@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, assert_never
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from typing_extensions import assert_never
 
 from kronc_ns.geometry.camera import Camera, project
 from kronc_ns.geometry.poses import compose, invert, look_at, make_pose, transform

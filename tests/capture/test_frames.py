@@ -10,7 +10,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from kronc_ns.capture import video as video_module
-from kronc_ns.capture.frames import Frames, check_source, copy_reference, frame_names, prepare_frames
+from kronc_ns.capture.frames import Frames, check_source, copy_reference, find_frames, frame_names, prepare_frames
 from kronc_ns.capture.images import downscale, downscale_factors
 from kronc_ns.capture.masks import downscale_mask, find_masks, read_mask, write_masks
 from kronc_ns.capture.source import find_source, natural_key
@@ -49,7 +49,8 @@ def _prepare(data: Path, out: Path, **options) -> Frames:
     out.mkdir(exist_ok=True)
     source = find_source(data)
     check_source(source)
-    return prepare_frames(source, out, **options)
+    steps = options.pop("progress", None)
+    return find_frames(source, out, **options) or prepare_frames(source, out, **options, progress=steps)
 
 
 def _is_red(image: Image.Image, where: tuple[float, float]) -> bool:

@@ -22,6 +22,7 @@ from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, make_capture
 
 VIEWS = 12
+EXACT = "adam:\n  steps: 1000\n  learning_rate: 0.05\n"
 FAST = "adam:\n  steps: 300\n  learning_rate: 0.05\n"
 HASTY = "adam:\n  steps: 3\n"  # too little for anything
 
@@ -47,9 +48,15 @@ def config(tmp_path: Path) -> SolverOptions:
 
 
 @pytest.fixture
-def scene(tmp_path: Path, capture: Capture) -> Path:
+def scene(tmp_path: Path, made_scene: Path) -> Path:
+    """A copy of the scene that the test may change."""
+    return Path(shutil.copytree(made_scene, tmp_path / "scene"))
+
+
+@pytest.fixture(scope="module")
+def made_scene(tmp_path_factory: pytest.TempPathFactory, capture: Capture) -> Path:
     """Scene folder with the true poses given, photos IMG_1 ... IMG_12, masks and a reference."""
-    folder = tmp_path / "scene"
+    folder = tmp_path_factory.mktemp("made") / "scene"
     write_capture(folder, capture, start=capture.c2w)
     for file in ("transforms.json", "reference.json", "keypoints.json"):
         content = json.loads((folder / file).read_text())
@@ -89,11 +96,11 @@ def _write_openpifpaf(folder: Path, capture: Capture, names: list[str]) -> None:
         (folder / f"{name}.predictions.json").write_text(text)
 
 
-def test_scene_folder_to_dataset(
-    scene: Path, tmp_path: Path, config: SolverOptions, capture: Capture, capsys: pytest.CaptureFixture[str]
-):
+def test_scene_folder_to_dataset(scene: Path, tmp_path: Path, capture: Capture, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "out"
-    assert _status(KroncToNerfstudio(data=scene, output_dir=out, solve=config)) == 0
+    (tmp_path / "exact.yaml").write_text(EXACT)
+    solver = SolverOptions(config=str(tmp_path / "exact.yaml"))
+    assert _status(KroncToNerfstudio(data=scene, output_dir=out, solve=solver)) == 0
     printed = capsys.readouterr()
     assert "12 of 12" in printed.out
     assert "400.0 px: transforms.json" in printed.out
@@ -185,6 +192,12 @@ def test_photos_without_keypoints_say_how_to_go_on(
     assert _status(KroncToNerfstudio(**options)) == 2
     assert "is solved already: give --keypoints" in capsys.readouterr().err
     assert (out / "kronc.json").exists()
+
+    (photos / "IMG_3.jpg").unlink()  # every later photo now has another number
+    assert _status(KroncToNerfstudio(keypoints=out / "images", **options)) == 2
+    assert "the keypoints beside them do not fit" in capsys.readouterr().err
+    assert (out / "kronc.json").exists()
+    assert (out / "images/frame_00012.jpg").exists()
 
 
 def test_keypoints_may_use_the_names_of_the_photos(

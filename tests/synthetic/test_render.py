@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kronc_ns.synthetic.car import CarModel, build_car
+from kronc_ns.synthetic.car_parts import CarShape
 from kronc_ns.synthetic.render import Rendering, _ground_levels, _wall_levels, keypoint_visibility, render_view
 
 SIZE, FOCAL = 96, 82.0
@@ -31,7 +32,7 @@ def view(car: CarModel, c2w: np.ndarray, *, ground: bool, samples: int = 2) -> R
 
 @pytest.fixture(scope="module")
 def car() -> CarModel:
-    return build_car()
+    return build_car(CarShape())
 
 
 def test_visibility_follows_the_side_of_the_car(car: CarModel) -> None:

@@ -1,0 +1,91 @@
+"""Are the poses good enough to train on? The same training on solved, exact and unoptimised poses."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from kronc_ns.errors import KroncError
+from kronc_ns.export import claim_output, write_solution
+from kronc_ns.geometry.alignment import umeyama
+from kronc_ns.init import circular_poses
+from kronc_ns.pipeline import KroncConfig, solve_scene
+from kronc_ns.scene import Scene, load_scene, read_poses
+from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
+
+Poses = Literal["exact", "solved", "circle"]
+
+
+def write_variant(folder: Path, data: Path, which: Poses, config: KroncConfig, points: Float[Tensor, "j 3"]) -> None:
+    """A data set of the rendered capture ``data`` with one kind of poses, ready for `kronc-dataparser`.
+
+    ``points`` are the true keypoints in the world of reference.json. The unoptimised circle is brought as near to
+    the truth as a similarity can, so that the car lies in its scene box.
+    """
+    scene = load_scene(data)
+    reference = read_poses(data / "reference.json")
+    truth = torch.stack([reference[name] for name in scene.names])
+    claim_output(folder)
+    if which == "solved":
+        solution = solve_scene(scene, config)
+    else:
+        c2w = truth
+        if which == "circle":
+            circle = circular_poses(len(scene), config.radius_m, config.direction, config.laps)
+            c2w = umeyama(circle[..., 3], truth[..., 3]).apply_to_poses(circle)
+        solution = _as_solution(scene.names, scene, c2w, points)
+    write_solution(folder, scene, solution, data, inputs=which)
+    (folder / "keypoints.json").write_bytes((data / "keypoints.json").read_bytes())
+
+
+def train(data: Path, method: str, out: Path, options: Sequence[str] = ()) -> Path:
+    """`ns-train METHOD` on a solved data set; the path of the run's config.yml."""
+    arguments = ["--data", str(data), "--output-dir", str(out), "--experiment-name", data.name, "--timestamp", "run"]
+    run("ns-train", method, *arguments, *options, "kronc-dataparser")
+    return out / data.name / method / "run" / "config.yml"
+
+
+def evaluate(config: Path, renders: Path | None = None) -> dict[str, Any]:
+    """`ns-eval` of a run: mean PSNR, SSIM and LPIPS (nan where its weights are missing) over the test views."""
+    output = config.parent / "eval.json"
+    images = ["--render-output-path", str(renders)] if renders is not None else []
+    run("ns-eval", "--load-config", str(config), "--output-path", str(output), *images)
+    return json.loads(output.read_text())["results"]
+
+
+def run(command: str, *arguments: str) -> str:
+    """Run one of nerfstudio's commands of this environment; its output, or an error that ends with it."""
+    path = Path(sys.executable).parent / command
+    done = subprocess.run([str(path), *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        last = "\n".join((done.stdout + done.stderr).strip().splitlines()[-15:])
+        raise KroncError(f"{command} ended with status {done.returncode}: {last}")
+    return done.stdout + done.stderr
+
+
+def _as_solution(names: tuple[str, ...], scene: Scene, c2w: Tensor, points: Tensor) -> Solution:
+    views = tuple(ViewReport(name, ViewStatus.SOLVED, 0, 0, None) for name in names)
+    depths = torch.full(scene.visibility.shape, float("nan"), dtype=torch.float64)
+    return Solution(
+        status=Status.CONVERGED,
+        reason="poses that were not solved, for comparison",
+        names=names,
+        camera=scene.camera,
+        c2w=c2w,
+        points=points,
+        depths=depths,
+        views=views,
+        initial_c2w=c2w,
+        solver="none",
+        init="given",
+        iterations=0,
+        seconds=0.0,
+        rmse_px=float("nan"),
+        median_px=float("nan"),
+    )

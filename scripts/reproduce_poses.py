@@ -1,0 +1,49 @@
+#!/usr/bin/env python
+"""Pose accuracy of the solver: `python scripts/reproduce_poses.py [--seeds N] [--capture SCENE_FOLDER] [--json]`."""
+
+import json
+import platform
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+
+from kronc_ns.benchmark.poses import SETTINGS, measure, measure_folder
+from kronc_ns.config import load_config
+
+
+@dataclass
+class Options:
+    """Solve synthetic captures of report seeds 0, 1, ... and, if given, a real capture with a reference.json."""
+
+    seeds: int = 3
+    capture: Path | None = None
+    config: str = "turntable"
+    """Preset for the real capture."""
+    json: bool = False
+
+
+def main(options: Options) -> None:
+    """Print a Markdown table, or JSON lines."""
+    torch.set_num_threads(1)
+    runs = [(s.name, seed, measure(s, seed)) for s in SETTINGS for seed in range(options.seeds)]
+    if options.capture is not None:
+        runs.append((options.capture.name, 0, measure_folder(options.capture, load_config(options.config))))
+    if options.json:
+        for name, seed, figures in runs:
+            print(json.dumps({"setting": name, "seed": seed, **figures}))
+        return
+    print(f"one CPU core, {platform.machine()}, torch {torch.__version__}\n")
+    print("| setting | seed | views | rotation mean / median (deg) | translation mean / median (cm) | s | steps/s |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name, seed, f in runs:
+        rotation, translation = f["rotation_deg"], f["translation"]
+        print(
+            f"| {name} | {seed} | {f['registered']}/{f['views']} | {rotation['mean']:.4f} / {rotation['median']:.4f} "
+            f"| {100 * translation['mean']:.2f} / {100 * translation['median']:.2f} | {f['seconds']:.1f} | {f['steps_per_s']:.0f} |"
+        )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
