@@ -107,16 +107,20 @@ class Synth:
         for name, share in shares.items():
             if not 0 <= share < 1:
                 raise KroncError(f"{name} is {share}: expected a share from 0 to below 1")
-        noises = {"--noise-px": self.noise_px, "--pose-noise-deg": self.pose_noise_deg, "--pose-noise-m": self.pose_noise_m}
+        noises = {
+            "--noise-px": self.noise_px,
+            "--pose-noise-deg": self.pose_noise_deg,
+            "--pose-noise-m": self.pose_noise_m,
+        }
         for name, noise in noises.items():
             if not 0 <= noise < math.inf:
                 raise KroncError(f"{name} is {noise}: expected a standard deviation, 0 or more")
         if self.views < 1 or (self.width is not None and self.width < 16):
-            raise KroncError(f"--views {self.views} --width {self.width}: expected at least 1 view of at least 16 pixels")
+            raise KroncError(
+                f"--views {self.views} --width {self.width}: expected at least 1 view of at least 16 pixels"
+            )
         camera = default_camera(self.preset, self.width)
-        capture = make_capture(
-            self.preset, self.views, self.seed, self.noise_px, self.missing, self.outliers, camera
-        )
+        capture = make_capture(self.preset, self.views, self.seed, self.noise_px, self.missing, self.outliers, camera)
         start = None
         if self.pose_noise_deg or self.pose_noise_m:
             generator = torch.Generator().manual_seed(self.seed)
@@ -166,7 +170,9 @@ Command = (
 
 def main() -> None:
     """Entry point of `kronc`."""
-    command = tyro.cli(Command, prog="kronc", description="Camera poses of a walk around a car from semantic keypoints.")
+    command = tyro.cli(
+        Command, prog="kronc", description="Camera poses of a walk around a car from semantic keypoints."
+    )
     with exit_on_error():
         raise SystemExit(command.run())
 

@@ -34,7 +34,8 @@ def load_config(name_or_path: str | None = None, **overrides: Any) -> KroncConfi
             path = preset_folder() / f"{name_or_path}.yaml"
         if not path.is_file():
             raise KroncError(
-                f"there is no preset {name_or_path!r}: expected one of {', '.join(preset_names())} or a path to a .yaml file"
+                f"there is no preset {name_or_path!r}: "
+                f"expected one of {', '.join(preset_names())} or a path to a .yaml file"
             )
         try:
             content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -87,7 +88,9 @@ def _update(target: Any, content: Any, where: str) -> Any:
             raise KroncError(f"{where}: unknown option {key!r}: expected one of {', '.join(names)}")
         current = getattr(target, key)
         changes[key] = (
-            _update(current, value, f"{where}, {key}") if is_dataclass(current) else _check(value, hints[key], f"{where}, {key}")
+            _update(current, value, f"{where}, {key}")
+            if is_dataclass(current)
+            else _check(value, hints[key], f"{where}, {key}")
         )
     try:
         return replace(target, **changes)
@@ -98,7 +101,9 @@ def _update(target: Any, content: Any, where: str) -> Any:
 def _check(value: Any, kind: Any, where: str) -> Any:
     if get_origin(kind) is Literal:
         if value not in get_args(kind):
-            raise KroncError(f"{where}: {value!r} is not allowed: expected one of {', '.join(map(str, get_args(kind)))}")
+            raise KroncError(
+                f"{where}: {value!r} is not allowed: expected one of {', '.join(map(str, get_args(kind)))}"
+            )
         return value
     if kind is float and not isinstance(value, bool):
         try:

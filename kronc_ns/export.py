@@ -37,7 +37,11 @@ def claim_output(folder: Path) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise KroncError(f"{folder} is a file: expected a folder for the output")
-    if folder.is_dir() and any(folder.iterdir()) and not ((folder / "kronc.json").exists() or (folder / MARKER).exists()):
+    if (
+        folder.is_dir()
+        and any(folder.iterdir())
+        and not ((folder / "kronc.json").exists() or (folder / MARKER).exists())
+    ):
         raise KroncError(f"{folder} already holds data that kronc did not write: choose a new or empty folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -128,7 +132,7 @@ def solution_dict(solution: Solution) -> dict[str, Any]:
             for view in solution.views
         ],
         "points": [[_number(x) for x in point] for point in solution.points.tolist()],
-        "history": {key: list(values) for key, values in solution.history.items()},
+        "history": {key: [_number(x) for x in values] for key, values in solution.history.items()},
     }
 
 
@@ -181,6 +185,8 @@ def write_ply(path: Path, solved: Path) -> int:
     """Write camera centres (blue) and keypoints (red) of a solved folder as a point cloud; returns their number."""
     poses = read_poses(solved / "transforms.json")
     points = _solved_points(solved)
+    if not poses:
+        raise KroncError(f"{solved / 'transforms.json'}: no view has a pose, there is nothing to export")
     centres = torch.stack(list(poses.values()))[..., 3].numpy()
     cloud = np.concatenate([centres, points])
     colours = np.array([[40, 80, 200, 255]] * len(centres) + [[200, 40, 40, 255]] * len(points), dtype=np.uint8)
@@ -192,7 +198,8 @@ def write_ply(path: Path, solved: Path) -> int:
 def _solved_points(solved: Path) -> Float[np.ndarray, "j 3"]:
     """The keypoints of a kronc.json that were solved."""
     file = solved / "kronc.json"
+    content = read_json(file)
     try:
-        return np.array([point for point in read_json(file)["points"] if None not in point], dtype=float).reshape(-1, 3)
+        return np.array([point for point in content["points"] if None not in point], dtype=float).reshape(-1, 3)
     except (KeyError, TypeError, ValueError):
         raise KroncError(f'{file}: expected "points", as `kronc solve` writes them: solve again') from None

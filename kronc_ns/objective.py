@@ -24,7 +24,11 @@ def reproject(centroid: Float[Tensor, "j 3"], c2w: Float[Tensor, "n 3 4"], camer
 
 
 def distances(
-    c2w: Float[Tensor, "n 3 4"], z: Float[Tensor, "n j"], uv: Float[Tensor, "n j 2"], m: Float[Tensor, "n j"], camera: Camera
+    c2w: Float[Tensor, "n 3 4"],
+    z: Float[Tensor, "n j"],
+    uv: Float[Tensor, "n j 2"],
+    m: Float[Tensor, "n j"],
+    camera: Camera,
 ) -> tuple[Float[Tensor, "n j"], Float[Tensor, "n j"]]:
     """The two norms of eq. 4: to the centroid in the world (metres) and in the image (pixels); 0 where m = 0."""
     points = backproject(uv, z, c2w, camera)

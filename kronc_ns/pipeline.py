@@ -119,7 +119,8 @@ def solve_scene(scene: Scene, config: KroncConfig | None = None, progress: Progr
     m = scene.visibility * usable[:, None]
     if int((m.sum(0) >= 2).sum()) < MIN_POINTS:
         raise KroncError(
-            f"fewer than {MIN_POINTS} keypoints are seen by two or more views: the views do not overlap; add views between"
+            f"fewer than {MIN_POINTS} keypoints are seen by two or more views: "
+            "the views do not overlap; add views between"
         )
     device = torch.device("cuda" if config.device == "auto" and torch.cuda.is_available() else _device(config))
     initial = initial_poses(scene, config)
@@ -131,7 +132,9 @@ def solve_scene(scene: Scene, config: KroncConfig | None = None, progress: Progr
     depths = torch.full_like(m, math.nan)
     depths[usable] = result.depths.double().cpu()
     if not (c2w[usable].isfinite().all() and points[m.sum(0) >= 2].isfinite().all()):
-        raise KroncError("the optimisation diverged to values that are not finite: lower adam.learning_rate or mend the start")
+        raise KroncError(
+            "the optimisation diverged to values that are not finite: lower adam.learning_rate or mend the start"
+        )
 
     placement = _placement(scene, config, initial[usable], c2w[usable], points)
     c2w[usable] = placement.apply_to_poses(c2w[usable])
@@ -293,7 +296,9 @@ def verify(scene: Scene, solution: Solution) -> Solution:
     kept = inlier & solved[:, None]
     median = float(error[solved].nanmedian()) if solved.any() else math.nan
     total = float((torch.where(kept, error.square(), 0.0).sum() / kept.sum().clamp_min(1)).sqrt())
-    status, reason = _judge(len(scene), int(solved.sum()), float(measured.median()) if len(measured) else math.inf, diagonal)
+    status, reason = _judge(
+        len(scene), int(solved.sum()), float(measured.median()) if len(measured) else math.inf, diagonal
+    )
     if status is not Status.CONVERGED and solution.init == "circular":
         reason += "; was the lap walked the other way (direction cw), or not whole (laps)?"
     return replace(

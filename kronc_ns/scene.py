@@ -44,7 +44,8 @@ class Scene:
     def __post_init__(self) -> None:
         if self.keypoints.shape != (len(self.names), len(self.schema), 3):
             raise KroncError(
-                f"keypoints have shape {tuple(self.keypoints.shape)}: expected ({len(self.names)}, {len(self.schema)}, 3)"
+                f"keypoints have shape {tuple(self.keypoints.shape)}: "
+                f"expected ({len(self.names)}, {len(self.schema)}, 3)"
             )
 
     def __len__(self) -> int:
@@ -108,7 +109,9 @@ def camera_and_frames(content: Any, file: Path) -> tuple[Camera, list[dict[str, 
     if twice:
         raise KroncError(f"{file}: {twice[0]} is listed twice: expected one frame per image")
     if content.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
-        raise KroncError(f"{file}: camera_model {content['camera_model']!r} is not supported: expected OPENCV or PINHOLE")
+        raise KroncError(
+            f"{file}: camera_model {content['camera_model']!r} is not supported: expected OPENCV or PINHOLE"
+        )
     cameras = set()
     for frame in frames:
         merged = {key: frame.get(key, content.get(key)) for key in _INTRINSICS}
@@ -120,7 +123,8 @@ def camera_and_frames(content: Any, file: Path) -> tuple[Camera, list[dict[str, 
             numbers = [float(merged[key] or 0.0) for key in _INTRINSICS]
         except (TypeError, ValueError):
             raise KroncError(f"{file}: intrinsics {merged} are not all numbers") from None
-        cameras.add(Camera(*numbers[:4], int(numbers[4]), int(numbers[5]), *numbers[6:]))
+        fx, fy, cx, cy, width, height, k1, k2, p1, p2 = numbers
+        cameras.add(Camera(fx, fy, cx, cy, int(width), int(height), k1, k2, p1, p2))
     if len(cameras) > 1:
         sizes = sorted({(c.width, c.height) for c in cameras})
         what = f"images of different sizes {sizes}" if len(sizes) > 1 else "frames with different intrinsics"
@@ -134,8 +138,8 @@ def match_keypoints(
     """Rows for each view from a keypoint file, matched by path or else by file name; and a note on choices made."""
     if found.size is not None and found.size != (camera.width, camera.height):
         raise KroncError(
-            f"{found.source} is for {found.size[0]}x{found.size[1]} images, the camera says {camera.width}x{camera.height}: "
-            "expected keypoints in the pixels of the images"
+            f"{found.source} is for {found.size[0]}x{found.size[1]} images, the camera says "
+            f"{camera.width}x{camera.height}: expected keypoints in the pixels of the images"
         )
     by_name: dict[str, str] = {}
     for name in names:
@@ -156,7 +160,9 @@ def match_keypoints(
     empty = np.zeros((0, len(found.schema), 3))
     instances = [matched.get(name, empty) for name in names]
     if not any((rows[..., 2] > 0).any() for rows in instances):
-        raise KroncError(f"{found.source}: no keypoints for any of the {len(names)} images: expected at least 4 in 3 views")
+        raise KroncError(
+            f"{found.source}: no keypoints for any of the {len(names)} images: expected at least 4 in 3 views"
+        )
     several = [i for i, rows in enumerate(instances) if len(rows) > 1]
     read = [_read_mask(path) if i in several else None for i, path in enumerate(masks)] if masks and several else None
     rows, note = select_instances(instances, (camera.width, camera.height), read)
@@ -229,7 +235,9 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
     except (OSError, ValueError):
         image = None
     if image is None or image.ndim != 2:
-        raise KroncError(f"{path} is no depth map: expected a 16-bit single-channel image in millimetres or .npy in metres")
+        raise KroncError(
+            f"{path} is no depth map: expected a 16-bit single-channel image in millimetres or .npy in metres"
+        )
     return image.astype(np.float64) * _DEPTH_UNIT_M
 
 

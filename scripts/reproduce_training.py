@@ -9,10 +9,10 @@ from typing import get_args
 import torch
 import tyro
 
-from kronc_ns.benchmark.training import Poses, evaluate, train, write_variant
+from kronc_ns.benchmark.training import Poses, add_half_size, evaluate, train, write_variant
 from kronc_ns.config import load_config
 from kronc_ns.synthetic.folder import write_capture
-from kronc_ns.synthetic.scenes import default_camera, make_capture
+from kronc_ns.synthetic.scenes import make_capture
 
 
 @dataclass
@@ -21,9 +21,9 @@ class Options:
 
     output_dir: Path
     method: str = "kronc-tensorf-cpu"
-    views: int = 48
-    width: int = 240
+    views: int = 40
     noise_px: float = 1.0
+    """Keypoint noise in the rendered 480x270 frames; training is on half their size."""
     seed: int = 0
     iterations: int | None = None
     """Training iterations (default: the method's)."""
@@ -31,16 +31,16 @@ class Options:
 
 def main(options: Options) -> None:
     """Print one JSON line per kind of poses."""
-    camera = default_camera("walk", options.width)
-    capture = make_capture("walk", options.views, options.seed, options.noise_px, camera=camera)
+    capture = make_capture("walk", options.views, options.seed, options.noise_px)
     data = options.output_dir / "capture"
     write_capture(data, capture, render=True)
+    add_half_size(data)
     points = torch.from_numpy(capture.car.keypoints)
     extra = [] if options.iterations is None else ["--max-num-iterations", str(options.iterations)]
     for which in get_args(Poses):
         folder = options.output_dir / which
         write_variant(folder, data, which, load_config("phone_walk"), points)
-        config = train(folder, options.method, options.output_dir / "runs", extra)
+        config = train(folder, options.method, options.output_dir / "runs", extra, ["--downscale-factor", "2"])
         results = evaluate(config, options.output_dir / "renders" / which)
         print(json.dumps({"poses": which, "psnr": results["psnr"], "ssim": results["ssim"]}), flush=True)
 

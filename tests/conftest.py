@@ -7,7 +7,14 @@ import jaxtyping
 import pytest
 
 with jaxtyping.install_import_hook(
-    ["kronc_ns.geometry", "kronc_ns.objective", "kronc_ns.init", "kronc_ns.solve", "kronc_ns.keypoints", "kronc_ns.evaluate"],
+    [
+        "kronc_ns.geometry",
+        "kronc_ns.objective",
+        "kronc_ns.init",
+        "kronc_ns.solve",
+        "kronc_ns.keypoints",
+        "kronc_ns.evaluate",
+    ],
     "beartype.beartype",
 ):
     import kronc_ns.evaluate

@@ -77,7 +77,7 @@ def hasty(tmp_path) -> Path:
 def made(tmp_path_factory) -> Path:
     """What `kronc synth` writes, with noisy poses to start from."""
     folder = tmp_path_factory.mktemp("cli") / "scene"
-    options = {"--views": 12, "--noise-px": 0.5, "--pose-noise-deg": 2.0, "--pose-noise-m": 0.1, "--seed": 5}
+    options = {"--views": 12, "--noise-px": 0.5, "--pose-noise-deg": 4.0, "--pose-noise-m": 0.3, "--seed": 5}
     with pytest.MonkeyPatch.context() as patch:
         flat = [str(part) for pair in options.items() for part in pair]
         patch.setattr(sys, "argv", ["kronc", "synth", "--output-dir", str(folder), *flat])
@@ -194,7 +194,9 @@ def test_noise_is_on_the_start_only(kronc, tmp_path):
     assert kronc("synth", "--output-dir", tmp_path / "a", "--views", 40, *noise).status == 0
     content = json.loads((tmp_path / "a/reference.json").read_text())
     camera, _ = camera_and_frames(content, tmp_path)
-    truth, start = (torch.stack(list(read_poses(tmp_path / "a" / f"{f}.json").values())) for f in ("reference", "transforms"))
+    truth, start = (
+        torch.stack(list(read_poses(tmp_path / "a" / f"{f}.json").values())) for f in ("reference", "transforms")
+    )
     rows = np.concatenate(list(read_keypoints(tmp_path / "a").frames.values()))
     points = torch.from_numpy(build_car(CarShape()).keypoints).expand(40, -1, -1)
     pixels = project(transform(invert(truth), points), camera).numpy()
@@ -240,7 +242,9 @@ def test_rendered_captures_have_images_masks_and_depths(kronc, tmp_path, preset,
         on_car = mask[line, column] > 0
         assert on_car.mean() > 0.7
         assert np.median(np.abs(depth[line, column] - z)[on_car]) < 0.06
-        assert not torch.equal(read_poses(tmp_path / "a/transforms.json")[frame["file_path"]], reference[frame["file_path"]])
+        assert not torch.equal(
+            read_poses(tmp_path / "a/transforms.json")[frame["file_path"]], reference[frame["file_path"]]
+        )
 
 
 @pytest.mark.parametrize(
@@ -270,7 +274,11 @@ def test_wrong_paths_are_named(kronc, scene, tmp_path):
     assert kronc("solve", "--data", tmp_path / "empty", "--output-dir", out).refused("transforms.json")
     assert kronc("solve", "--data", scene / "transforms.json", "--output-dir", out).refused("is no folder")
     for option in ("--poses", "--reference"):
-        paths = {"--poses": scene / "reference.json", "--reference": scene / "reference.json", option: tmp_path / "no.json"}
+        paths = {
+            "--poses": scene / "reference.json",
+            "--reference": scene / "reference.json",
+            option: tmp_path / "no.json",
+        }
         assert kronc("eval", *[part for pair in paths.items() for part in pair]).refused("no.json")
     assert kronc("eval", "--poses", scene, "--reference", scene / "reference.json").refused(str(scene))
     assert kronc("export", "--data", tmp_path / "empty", "--format", "ply").refused("kronc.json", "kronc solve")
@@ -362,6 +370,9 @@ def test_no_trustworthy_solution_exits_3_says_why_and_marks_its_files(kronc, sce
     assert report["status"] == "failed"
     assert (tmp_path / "out/transforms.json").exists()
     assert not (tmp_path / "out" / MARKER).exists()
+    if not read_poses(tmp_path / "out/transforms.json"):
+        for format_ in ("ply", "colmap"):
+            assert kronc("export", "--data", tmp_path / "out", "--format", format_).refused("transforms.json")
 
 
 def test_ctrl_c_exits_130_and_leaves_no_result(kronc, scene, short, tmp_path, monkeypatch):
@@ -393,4 +404,6 @@ def test_a_full_disk_exits_2_and_leaves_no_result(kronc, scene, hasty, tmp_path,
         assert made.refused("made/", "cannot be written", "No space left on device")
     assert not (out / "kronc.json").exists()
     assert kronc("export", "--data", out, "--format", "ply").refused("kronc.json")
-    assert kronc("synth", "--output-dir", tmp_path / "made", "--views", 2).status == 0, "its own rest is no foreign data"
+    assert kronc("synth", "--output-dir", tmp_path / "made", "--views", 2).status == 0, (
+        "its own rest is no foreign data"
+    )

@@ -107,7 +107,9 @@ def test_errors_name_the_file_the_key_and_what_was_expected(written, text, parts
         assert part in str(caught.value)
 
 
-@pytest.mark.parametrize(("text", "name"), [("radius_m: -1\n", "radius_m"), ("laps: .inf\n", "laps"), ("adam:\n  steps: 0\n", "adam.steps")])
+@pytest.mark.parametrize(
+    ("text", "name"), [("radius_m: -1\n", "radius_m"), ("laps: .inf\n", "laps"), ("adam:\n  steps: 0\n", "adam.steps")]
+)
 def test_impossible_values_name_the_file_too(written, text, name):
     path = written(text)
     with pytest.raises(KroncError, match=name) as caught:

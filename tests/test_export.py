@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import os
 import zlib  # noqa: F401 - before pycolmap, which aborts the process otherwise
 from dataclasses import replace
@@ -125,6 +126,14 @@ def test_the_report_names_every_view_and_holds_no_nan(solved, solution):
     }
     assert report["points"][3] == [None] * 3
     np.testing.assert_allclose(report["points"][4], solution.points[4])
+
+
+def test_a_loss_that_was_not_finite_is_null(tmp_path, walk_folder, scene, solution):
+    wild = replace(solution, history={"step": [1.0, 2.0], "loss": [5.0, math.nan]}, rmse_px=math.nan)
+    claim_output(tmp_path / "out")
+    write_solution(tmp_path / "out", scene, wild, walk_folder, "abc")
+    report = json.loads((tmp_path / "out/kronc.json").read_text())
+    assert (report["history"]["loss"], report["rmse_px"]) == ([5.0, None], None)
 
 
 def test_the_keypoint_cloud_holds_the_known_points(solved, solution):

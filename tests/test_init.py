@@ -17,7 +17,9 @@ def test_the_papers_circle():
     torch.testing.assert_close(c2w[:, :, 3].norm(dim=1), torch.full((36,), 4.0, dtype=torch.float64))
     torch.testing.assert_close(azimuths(c2w), torch.arange(36, dtype=torch.float64) * 10, atol=1e-9, rtol=0)
     torch.testing.assert_close(c2w[:, :, 2], -c2w[:, :, 3] / 4.0)  # facing the axis
-    torch.testing.assert_close(c2w[:, :, 1], torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(36, 3))  # no tilt
+    torch.testing.assert_close(
+        c2w[:, :, 1], torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(36, 3)
+    )  # no tilt
 
 
 def test_direction_and_laps():

@@ -48,5 +48,10 @@ def test_imports_point_downwards(path):
 
 def test_dataparser_stays_clear_of_the_circular_import():
     reached = imported(PACKAGE / "plugin" / "dataparser.py")
-    forbidden = ("nerfstudio.engine.trainer", "nerfstudio.pipelines", "nerfstudio.plugins.types", "kronc_ns.plugin.methods")
+    forbidden = (
+        "nerfstudio.engine.trainer",
+        "nerfstudio.pipelines",
+        "nerfstudio.plugins.types",
+        "kronc_ns.plugin.methods",
+    )
     assert not [name for name in reached if name.startswith(forbidden)]

@@ -71,6 +71,6 @@ def test_written_out_gradient_against_autograd():
         t, depth = c2w[..., 3].clone().requires_grad_(), z.clone().requires_grad_()
         expected = loss(make_pose(rotation_from_r6(r6), t), depth, uv, m, CAMERA, weight_2d, weight_3d)
         gradient = torch.autograd.grad(expected, (r6, t, depth))
-        assert abs(value - float(expected)) < 1e-9 * max(1.0, float(expected))
+        assert value == pytest.approx(expected.item(), rel=1e-9, abs=1e-9)
         flat = torch.cat([g.flatten() for g in gradient])
         torch.testing.assert_close(ours.parameters.grad, flat, rtol=1e-9, atol=1e-9)

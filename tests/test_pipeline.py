@@ -6,10 +6,10 @@ import torch
 
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.alignment import pose_errors, umeyama
+from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.init import noisy_poses
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.pipeline import KroncConfig, car_axes, fingerprint, residuals_px, solve_scene
-from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.scene import Scene, load_scene
 from kronc_ns.solve.adam import AdamConfig
 from kronc_ns.solve.solution import Status, ViewStatus
@@ -42,12 +42,16 @@ def test_solving_from_noisy_poses(noisy, walk_capture):
 
 
 def test_solving_from_the_circle_stands_the_car_upright(walk_capture):
-    solution = solve_scene(scene_of(walk_capture), KroncConfig(radius_m=5.0, adam=AdamConfig(steps=4000)))
+    solution = solve_scene(
+        scene_of(walk_capture), replace(QUICK, radius_m=5.0, adam=AdamConfig(steps=1500, learning_rate=0.03))
+    )
     assert solution.init == "circular"
     assert solution.status is Status.CONVERGED
     points, truth = solution.points, torch.from_numpy(walk_capture.car.keypoints)
     known = points.isfinite().all(-1)
-    scale = torch.linalg.lstsq(points[known].flatten()[:, None], (truth[known] - truth[known].mean(0)).flatten()).solution
+    scale = torch.linalg.lstsq(
+        points[known].flatten()[:, None], (truth[known] - truth[known].mean(0)).flatten()
+    ).solution
     centred = points[known] - points[known].mean(0)
     error = (scale * centred - (truth[known] - truth[known].mean(0))).norm(dim=-1)
     assert error.median() < 0.05, "x forward, y left, z up, as the car really stands"
@@ -56,8 +60,7 @@ def test_solving_from_the_circle_stands_the_car_upright(walk_capture):
 
 
 def test_the_wrong_direction_is_not_called_converged(walk_capture):
-    wrong = KroncConfig(direction="cw", adam=AdamConfig(steps=2000))
-    solution = solve_scene(scene_of(walk_capture), wrong)
+    solution = solve_scene(scene_of(walk_capture), replace(QUICK, direction="cw"))
     assert solution.status is not Status.CONVERGED
     assert "other way" in solution.reason
 
@@ -153,7 +156,12 @@ def test_what_the_scene_lacks_is_named(walk_capture, config, message):
 
 
 def test_impossible_options_are_refused():
-    for change in ({"radius_m": 0.0}, {"laps": -1.0}, {"adam": AdamConfig(steps=0)}, {"adam": AdamConfig(learning_rate=math.nan)}):
+    for change in (
+        {"radius_m": 0.0},
+        {"laps": -1.0},
+        {"adam": AdamConfig(steps=0)},
+        {"adam": AdamConfig(learning_rate=math.nan)},
+    ):
         with pytest.raises(KroncError):
             KroncConfig(**change)
     with pytest.raises(KroncError, match="not both be 0"):

@@ -7,10 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor
 
+from kronc_ns.capture.images import load_image, write_downscales
+from kronc_ns.capture.masks import downscale_mask
 from kronc_ns.errors import KroncError
 from kronc_ns.export import claim_output, write_solution
 from kronc_ns.geometry.alignment import umeyama
@@ -44,10 +48,20 @@ def write_variant(folder: Path, data: Path, which: Poses, config: KroncConfig, p
     (folder / "keypoints.json").write_bytes((data / "keypoints.json").read_bytes())
 
 
-def train(data: Path, method: str, out: Path, options: Sequence[str] = ()) -> Path:
-    """`ns-train METHOD` on a solved data set; the path of the run's config.yml."""
+def add_half_size(data: Path) -> None:
+    """Write images_2 and masks_2 of a scene folder, as `ns-process-data kronc` does."""
+    for image in sorted((data / "images").iterdir()):
+        write_downscales(load_image(image), image, (2,))
+    (data / "masks_2").mkdir(exist_ok=True)
+    for mask in sorted((data / "masks").iterdir()):
+        half = downscale_mask(np.asarray(load_image(mask)), 2)
+        Image.fromarray(half).save(data / "masks_2" / mask.name)
+
+
+def train(data: Path, method: str, out: Path, options: Sequence[str] = (), parser: Sequence[str] = ()) -> Path:
+    """`ns-train METHOD OPTIONS kronc-dataparser PARSER` on a solved data set; the path of the run's config.yml."""
     arguments = ["--data", str(data), "--output-dir", str(out), "--experiment-name", data.name, "--timestamp", "run"]
-    run("ns-train", method, *arguments, *options, "kronc-dataparser")
+    run("ns-train", method, *arguments, *options, "kronc-dataparser", *parser)
     return out / data.name / method / "run" / "config.yml"
 
 

@@ -59,7 +59,10 @@ def write_keypoints(
         flip = [[i, f] for i, f in enumerate(schema.flip) if i < f]
         described = {"name": schema.name, "keypoints": list(schema.keypoints), "flip": flip}
     rows = [
-        {"file_path": name, "keypoints": [[round(float(u), 3), round(float(v), 3), round(float(c), 4)] for u, v, c in uvc]}
+        {
+            "file_path": name,
+            "keypoints": [[round(float(u), 3), round(float(v), 3), round(float(c), 4)] for u, v, c in uvc],
+        }
         for name, uvc in frames.items()
     ]
     write_json(path, {"schema": described, "width": size[0], "height": size[1], "frames": rows})
@@ -156,7 +159,9 @@ def _read_coco(path: Path, content: dict[str, Any]) -> Detections:
         images = {image["id"]: image for image in content["images"]}
         instances: dict[str, list[np.ndarray]] = {str(image["file_name"]): [] for image in images.values()}
         rows = [
-            (str(images[a["image_id"]]["file_name"]), a["keypoints"]) for a in content["annotations"] if "keypoints" in a
+            (str(images[a["image_id"]]["file_name"]), a["keypoints"])
+            for a in content["annotations"]
+            if "keypoints" in a
         ]
         sizes = {(int(i["width"]), int(i["height"])) for i in images.values() if {"width", "height"} <= i.keys()}
     except (KeyError, TypeError) as error:

@@ -108,18 +108,20 @@ _NAMES = (
 )
 
 _LEFT_RIGHT = (
-    (0, 57), (1, 56), (2, 55), (3, 54), (4, 53), (5, 52), (6, 51), (7, 50), (8, 49), (9, 48), (10, 47), (11,
-    46), (12, 45), (13, 44), (14, 43), (15, 42), (16, 41), (17, 40), (18, 39), (19, 38), (20, 37), (21, 36),
-    (22, 35), (23, 34), (24, 33), (25, 32), (26, 31), (27, 30), (28, 29), (59, 58), (61, 60), (62, 63), (65,
-    64),
-)
+    (0, 57), (1, 56), (2, 55), (3, 54), (4, 53), (5, 52), (6, 51), (7, 50), (8, 49), (9, 48), (10, 47), (11, 46),
+    (12, 45), (13, 44), (14, 43), (15, 42), (16, 41), (17, 40), (18, 39), (19, 38), (20, 37), (21, 36), (22, 35),
+    (23, 34), (24, 33), (25, 32), (26, 31), (27, 30), (28, 29), (59, 58), (61, 60), (62, 63), (65, 64),
+)  # fmt: skip
 
 _SKELETON_LEFT = (
     (0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (4, 3), (5, 6), (6, 7), (7, 10), (8, 9), (9, 10), (9, 12), (8, 11),
     (11, 12), (12, 15), (10, 15), (13, 14), (11, 16), (15, 19), (16, 18), (17, 18), (16, 24), (19, 20), (20, 21),
     (22, 23), (22, 25), (23, 26), (25, 26), (22, 24), (26, 27), (21, 28), (62, 65),
 )  # fmt: skip
-_SKELETON_ACROSS = ((0, 57), (8, 49), (24, 33), (28, 29), (27, 30), (58, 59), (60, 61), (58, 60), (59, 61), (62, 63), (64, 65), (63, 64))  # fmt: skip
+_SKELETON_ACROSS = (
+    (0, 57), (8, 49), (24, 33), (28, 29), (27, 30), (58, 59), (60, 61), (58, 60), (59, 61), (62, 63), (64, 65),
+    (63, 64),
+)  # fmt: skip
 
 _FLIP = tuple(dict([*_LEFT_RIGHT, *((right, left) for left, right in _LEFT_RIGHT)])[i] for i in range(len(_NAMES)))
 
@@ -130,9 +132,10 @@ APOLLOCAR3D_66 = KeypointSchema(
     left=tuple(left for left, _ in _LEFT_RIGHT),
     wheels=(7, 50, 20, 37),
     skeleton=tuple(
-        sorted({tuple(sorted(edge)) for edge in _SKELETON_LEFT}
-        | {tuple(sorted((_FLIP[a], _FLIP[b]))) for a, b in _SKELETON_LEFT}
-        | {tuple(sorted(edge)) for edge in _SKELETON_ACROSS})
+        sorted(
+            {(min(a, b), max(a, b)) for a, b in (*_SKELETON_LEFT, *_SKELETON_ACROSS)}
+            | {(min(_FLIP[a], _FLIP[b]), max(_FLIP[a], _FLIP[b])) for a, b in _SKELETON_LEFT}
+        )
     ),
 )
 """The 66 car keypoints of ApolloCar3D (Song et al., CVPR 2019), in its order. "left" is the car's own left.

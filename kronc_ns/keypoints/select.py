@@ -20,12 +20,15 @@ def select_instances(
     its size and nearness to the image centre; a jump of place or size between frames costs. The best path
     through all frames is found exactly (dynamic programming). A frame without any car gets rows of zeros.
     """
+    instances = [rows[(rows[..., 2] > 0).any(1)] for rows in instances]  # without a point there is no car
     filled = [i for i, rows in enumerate(instances) if len(rows)]
     chosen = np.zeros((len(instances), *instances[0].shape[1:]))
     if not filled:
         return chosen, "no car found in any image"
     boxes = [_boxes(instances[i], size) for i in filled]
-    scores = [_score(instances[i], box, size, masks[i] if masks else None) for i, box in zip(filled, boxes, strict=True)]
+    scores = [
+        _score(instances[i], box, size, masks[i] if masks else None) for i, box in zip(filled, boxes, strict=True)
+    ]
 
     total, back = scores[0], []
     for k in range(1, len(filled)):
@@ -47,11 +50,10 @@ def select_instances(
 
 
 def _boxes(rows: Float[np.ndarray, "m j 3"], size: tuple[int, int]) -> Float[np.ndarray, "m 4"]:
-    """(centre u, centre v, width, height) of each instance's seen points, in image diagonals; zeros without any."""
+    """(centre u, centre v, width, height) of each instance's seen points, in image diagonals."""
     seen = rows[..., 2:] > 0
-    any_seen = seen.any(1)
-    low = np.where(any_seen, np.where(seen, rows[..., :2], np.inf).min(1), 0.0)
-    high = np.where(any_seen, np.where(seen, rows[..., :2], -np.inf).max(1), 0.0)
+    low = np.where(seen, rows[..., :2], np.inf).min(1)
+    high = np.where(seen, rows[..., :2], -np.inf).max(1)
     return np.concatenate([(low + high) / 2, high - low], axis=1) / np.hypot(*size)
 
 

@@ -22,9 +22,7 @@ def read_report(folder: Path) -> dict[str, Any] | None:
     return read_json(folder / "kronc.json") if (folder / "kronc.json").exists() else None
 
 
-def solve_cached(
-    data: Path, scene: Scene, config: KroncConfig, progress: Progress | None
-) -> Path:
+def solve_cached(data: Path, scene: Scene, config: KroncConfig, progress: Progress | None) -> Path:
     """Folder with transforms.json and kronc.json for a scene: the cached one, else solved now.
 
     A cache that cannot be written is an error.

@@ -84,7 +84,6 @@ class KroncDataParser(DataParser):
         if report is not None and not config.any_solver_option():
             folder = config.data
         else:
-
             with progress_bar("solving poses") as progress:
                 folder = solve_cached(config.data, scene, config.solver_config(), progress)
             report = read_report(folder)
@@ -96,9 +95,7 @@ class KroncDataParser(DataParser):
         poses = read_poses(folder / "transforms.json")
         return scene, {PurePosixPath(name).name: pose for name, pose in poses.items()}, report
 
-    def _outputs(
-        self, split: str, scene: Scene, poses: dict[str, Tensor], report: dict[str, Any]
-    ) -> DataparserOutputs:
+    def _outputs(self, split: str, scene: Scene, poses: dict[str, Tensor], report: dict[str, Any]) -> DataparserOutputs:
         config = self.config
         test = test_views(len(scene), config.eval_interval, config.eval_fraction)
         posed = torch.tensor([PurePosixPath(name).name in poses for name in scene.names])
@@ -106,7 +103,9 @@ class KroncDataParser(DataParser):
         if chosen is None:
             raise KroncError(f"unknown split {split!r}: expected train, val, test or all")
         if not chosen.any():
-            raise KroncError(f"no view is left for the {split} split: {int(posed.sum())} of {len(scene)} views have a pose")
+            raise KroncError(
+                f"no view is left for the {split} split: {int(posed.sum())} of {len(scene)} views have a pose"
+            )
         indices = chosen.nonzero()[:, 0].tolist()
 
         all_c2w = torch.stack([poses[PurePosixPath(scene.names[i]).name] for i in posed.nonzero()[:, 0].tolist()])
@@ -134,7 +133,9 @@ class KroncDataParser(DataParser):
             cy=camera.cy,
             width=camera.width,
             height=camera.height,
-            distortion_params=torch.tensor([camera.k1, camera.k2, 0.0, 0.0, camera.p1, camera.p2]).expand(len(indices), -1),
+            distortion_params=torch.tensor([camera.k1, camera.k2, 0.0, 0.0, camera.p1, camera.p2]).expand(
+                len(indices), -1
+            ),
             camera_type=CameraType.PERSPECTIVE,
         )
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor.factor)
@@ -166,9 +167,7 @@ def test_views(views: int, interval: int, fraction: float | None) -> Bool[Tensor
     return test
 
 
-def car_box(
-    points: Float[Tensor, "j 3"], c2w: Float[Tensor, "n 3 4"], scale: float = 1.0
-) -> Float[Tensor, "2 3"]:
+def car_box(points: Float[Tensor, "j 3"], c2w: Float[Tensor, "n 3 4"], scale: float = 1.0) -> Float[Tensor, "2 3"]:
     """Lower and upper corner of the solved keypoints' box with a margin, scaled about its centre."""
     if len(points) < 2:
         raise KroncError(f"{len(points)} solved keypoints: expected at least 2 to know where the object is")

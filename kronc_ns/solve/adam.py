@@ -141,7 +141,9 @@ class LossGradient:
         self._residual.mul_(self._focal)
         torch.mul(self._residual, self._residual, out=self._scratch_2d)
         torch.sum(self._scratch_2d, dim=1, keepdim=True, out=self._norm_2d).sqrt_()
-        self._residual.mul_(self._weight_2d).div_(self._norm_2d.clamp_min_(_TINY)).mul_(self._focal).mul_(self._inverse_z)
+        self._residual.mul_(self._weight_2d).div_(self._norm_2d.clamp_min_(_TINY)).mul_(self._focal).mul_(
+            self._inverse_z
+        )
         self._grad_seen[:, :2] = self._residual
         torch.mul(self._residual, self._plane, out=self._plane)
         torch.sum(self._plane, dim=1, keepdim=True, out=self._inverse_z)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -175,7 +176,8 @@ def build_car(shape: CarShape = CarShape(), paint_rgb: Rgb = (36, 92, 168)) -> C
         left += wheel_parts(shape, x)
     left += _handles_and_mirror(shape, outlines)
     parts = left + [part.mirrored() for part in left]
-    for view, facing in (("front", 1), ("rear", -1)):
+    ends: tuple[tuple[Literal["front", "rear"], int], ...] = (("front", 1), ("rear", -1))
+    for view, facing in ends:
         plate = outlines[f"{view}_plate"]
         outermost = max(abs(surface_point(shape, view, 0.0, z)[0]) for z in plate[:, 1])
         centre = np.array([facing * (outermost - 0.012), 0, plate[:, 1].mean()])

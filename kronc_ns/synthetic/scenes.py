@@ -32,7 +32,7 @@ class Capture:
 
 
 def default_camera(preset: Preset, width: int | None = None) -> Camera:
-    """Intrinsics of a preset: 400x400, f = 555 (CarPatch), or 480x270, f = 400 (a phone, 62 degrees); resized to ``width``."""
+    """Intrinsics of a preset, resized to ``width``: 400x400, f = 555 (CarPatch) or 480x270, f = 400 (a phone)."""
     match preset:
         case "carpatch":
             camera = Camera(555.0, 555.0, 200.0, 200.0, 400, 400)

@@ -43,7 +43,9 @@ def test_umeyama_minimises_the_squared_distance():
 
 def test_coincident_points_give_a_finite_translation():
     found = umeyama(torch.zeros(5, 3, dtype=torch.float64), torch.ones(5, 3, dtype=torch.float64))
-    torch.testing.assert_close(found.apply(torch.zeros(1, 3, dtype=torch.float64)), torch.ones(1, 3, dtype=torch.float64))
+    torch.testing.assert_close(
+        found.apply(torch.zeros(1, 3, dtype=torch.float64)), torch.ones(1, 3, dtype=torch.float64)
+    )
 
 
 def test_pose_errors_do_not_see_the_world_frame():

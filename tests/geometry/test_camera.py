@@ -25,7 +25,11 @@ def test_projection_inverts_backprojection():
 
 
 def test_backprojection_is_the_papers_equation_1():
-    c2w, uv, z = poses(1), torch.tensor([[[100.0, 50.0]]], dtype=torch.float64), torch.tensor([[3.0]], dtype=torch.float64)
+    c2w, uv, z = (
+        poses(1),
+        torch.tensor([[[100.0, 50.0]]], dtype=torch.float64),
+        torch.tensor([[3.0]], dtype=torch.float64),
+    )
     k_inverse = np.linalg.inv(CAMERA.matrix)
     expected = c2w[0].numpy() @ np.append(k_inverse @ [100.0, 50.0, 1.0] * 3.0, 1.0)
     np.testing.assert_allclose(backproject(uv, z, c2w, CAMERA)[0, 0].numpy(), expected)
@@ -52,6 +56,6 @@ def test_scaling_the_image_scales_the_pixels():
 
 @pytest.mark.parametrize(("field", "value"), [("fx", 0.0), ("fy", -3.0), ("cx", math.nan), ("width", 0)])
 def test_impossible_cameras_are_refused(field, value):
-    values = dict(fx=500.0, fy=500.0, cx=1.0, cy=1.0, width=10, height=10) | {field: value}
+    values = {"fx": 500.0, "fy": 500.0, "cx": 1.0, "cy": 1.0, "width": 10, "height": 10, field: value}
     with pytest.raises(KroncError):
         Camera(**values)

@@ -49,7 +49,13 @@ def coco(labels, values) -> dict:
     return {
         "images": [{"id": 5, "file_name": "a.png", "width": 40, "height": 30}, {"id": 6, "file_name": "b.png"}],
         "categories": [{"id": 1, "name": "thing", "keypoints": ["p", "q", "r", "s"]}],
-        "annotations": [{"image_id": 5, "category_id": 1, "keypoints": [c for v, l in zip(values, labels) for c in (*v, l)]}],
+        "annotations": [
+            {
+                "image_id": 5,
+                "category_id": 1,
+                "keypoints": [c for v, seen in zip(values, labels, strict=True) for c in (*v, seen)],
+            }
+        ],
     }
 
 

@@ -33,7 +33,12 @@ def test_facts_agree_with_the_published_list():
 
 def test_wheels_are_wheel_centres():
     names = [APOLLOCAR3D_66.keypoints[i] for i in APOLLOCAR3D_66.wheels]
-    assert names == ["center_left_front_wheel", "center_right_front_wheel", "center_left_rear_wheel", "center_right_rear_wheel"]
+    assert names == [
+        "center_left_front_wheel",
+        "center_right_front_wheel",
+        "center_left_rear_wheel",
+        "center_right_rear_wheel",
+    ]
 
 
 @pytest.mark.parametrize("flip", [(0, 1, 2), (1, 2, 0, 3), (0, 1, 2, 9)])

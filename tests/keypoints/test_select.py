@@ -41,6 +41,13 @@ def test_frames_without_a_car_are_empty():
     assert "one car" in note
 
 
+def test_a_car_without_a_single_point_is_no_warning(recwarn):
+    nobody = np.zeros((5, 3))
+    rows, _ = select_instances([np.stack([nobody, car(200, 150, 80)]), nobody[None]], SIZE)
+    np.testing.assert_array_equal(rows, [car(200, 150, 80), nobody])
+    assert not recwarn.list
+
+
 def test_nothing_found_anywhere():
     rows, note = select_instances([np.zeros((0, 5, 3))] * 3, SIZE)
     assert rows.shape == (3, 5, 3)

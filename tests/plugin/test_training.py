@@ -6,26 +6,28 @@ import math
 import pytest
 import torch
 
-from kronc_ns.benchmark.training import evaluate, run, train, write_variant
+from kronc_ns.benchmark.training import add_half_size, evaluate, run, train, write_variant
 from kronc_ns.config import load_config
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 ITERATIONS = ["--max-num-iterations", "500"]
+HALF = ["--downscale-factor", "2"]
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Configs of the same short training on three kinds of poses of one rendered walk."""
     root = tmp_path_factory.mktemp("training")
-    capture = make_capture("walk", views=32, seed=3, noise_px=1.0, camera=default_camera("walk", 160))
+    capture = make_capture("walk", views=32, seed=3, noise_px=0.67, camera=default_camera("walk", 320))
     write_capture(root / "capture", capture, render=True)
+    add_half_size(root / "capture")
     points = torch.from_numpy(capture.car.keypoints)
     configs = {}
     for which in ("exact", "solved", "circle"):
         write_variant(root / which, root / "capture", which, load_config("phone_walk"), points)
-        configs[which] = train(root / which, "kronc-tensorf-cpu", root / "runs", ITERATIONS)
+        configs[which] = train(root / which, "kronc-tensorf-cpu", root / "runs", ITERATIONS, HALF)
     return configs
 
 
@@ -42,7 +44,7 @@ def test_training_resumes_from_its_checkpoint(runs):
     config = runs["solved"]
     root = config.parents[3]
     more = ["--load-dir", str(config.parent / "nerfstudio_models"), "--max-num-iterations", "10"]
-    resumed = train(root.parent / "solved", "kronc-tensorf-cpu", root / "resumed", more)
+    resumed = train(root.parent / "solved", "kronc-tensorf-cpu", root / "resumed", more, HALF)
     checkpoints = sorted((resumed.parent / "nerfstudio_models").glob("*.ckpt"))
     assert [int(path.stem.split("-")[1]) for path in checkpoints] == [509]
 

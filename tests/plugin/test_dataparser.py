@@ -1,0 +1,390 @@
+"""`kronc-dataparser`: solved once, poses as nerfstudio wants them, the user's folder untouched."""
+
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+pytest.importorskip("nerfstudio")
+
+from kronc_ns.config import load_config
+from kronc_ns.errors import KroncError
+from kronc_ns.export import write_solution
+from kronc_ns.geometry.poses import flip_camera_axes
+from kronc_ns.pipeline import solve_scene
+from kronc_ns.plugin.dataparser import KroncDataParser, KroncDataParserConfig
+from kronc_ns.plugin.images import cut_out
+from kronc_ns.scene import load_scene
+from kronc_ns.solve.solution import Solution
+from kronc_ns.synthetic.folder import write_capture
+from kronc_ns.synthetic.scenes import default_camera, make_capture
+
+pytestmark = pytest.mark.nerfstudio
+
+VIEWS = 16
+POOR = 5
+"""Index of the view that `poor` leaves too few keypoints."""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """Where this module's scene and cache lie."""
+    return tmp_path_factory.mktemp("dataparser")
+
+
+@pytest.fixture(scope="module")
+def rendered(place) -> Path:
+    """A small rendered walk without poses; tests only read it."""
+    capture = make_capture("walk", views=VIEWS, seed=7, noise_px=0.1, camera=default_camera("walk", 96))
+    write_capture(place / "walk", capture, render=True)
+    return place / "walk"
+
+
+@pytest.fixture(scope="module")
+def config(place) -> str:
+    (place / "quick.yaml").write_text("radius_m: 5.0\nadam:\n  steps: 1500\n  learning_rate: 0.03\n")
+    return str(place / "quick.yaml")
+
+
+@pytest.fixture(scope="module")
+def solution(rendered, config) -> Solution:
+    return solve_scene(load_scene(rendered), load_config(config))
+
+
+@pytest.fixture(autouse=True)
+def cache(place, monkeypatch) -> Path:
+    """One cache for all tests, so that they solve once."""
+    monkeypatch.setenv("KRONC_NS_CACHE", str(place / "cache"))
+    return place / "cache"
+
+
+@pytest.fixture
+def fresh_cache(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("KRONC_NS_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def no_solver(monkeypatch):
+    """From here on nothing may be solved."""
+
+    def fail(*_):
+        raise AssertionError("solved again")
+
+    return lambda: monkeypatch.setattr("kronc_ns.plugin.cache.solve_scene", fail)
+
+
+@pytest.fixture
+def changed(rendered, tmp_path) -> Path:
+    """A copy that a test may change."""
+    return Path(shutil.copytree(rendered, tmp_path / "walk"))
+
+
+@pytest.fixture
+def parser(rendered, config):
+    def build(data: Path = rendered, **options) -> KroncDataParser:
+        return KroncDataParserConfig(**{"data": data, "config": config, **options}).setup()
+
+    return build
+
+
+@pytest.fixture
+def outputs(parser):
+    def build(split: str = "train", **options):
+        return parser(**options).get_dataparser_outputs(split=split)
+
+    return build
+
+
+def snapshot(folder: Path) -> dict[Path, tuple[int, bytes]]:
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
+def view_numbers(output) -> list[int]:
+    return [int(path.stem.removeprefix("frame_")) - 1 for path in output.image_filenames]
+
+
+# ---- solving once
+
+
+def test_solved_once_and_the_users_folder_stays_as_it_is(rendered, outputs, fresh_cache, no_solver):
+    before = snapshot(rendered)
+    first = outputs()
+    no_solver()
+    second = outputs()
+    assert torch.equal(first.cameras.camera_to_worlds, second.cameras.camera_to_worlds)
+    assert first.image_filenames == second.image_filenames
+    assert snapshot(rendered) == before
+    assert any(fresh_cache.rglob("kronc.json"))
+
+
+def test_a_moved_capture_is_known_again_and_a_changed_one_is_not(changed, outputs, no_solver, edit):
+    first = outputs(background="keep")
+    no_solver()
+    moved = outputs(data=changed, background="keep")
+    assert torch.equal(first.cameras.camera_to_worlds, moved.cameras.camera_to_worlds)
+    assert all(path.is_relative_to(changed) for path in moved.image_filenames)
+    edit(changed / "keypoints.json", lambda c: c["frames"][2]["keypoints"].__setitem__(0, [1.0, 2.0, 1.0]))
+    with pytest.raises(AssertionError, match="solved again"):
+        outputs(data=changed)
+    with pytest.raises(AssertionError, match="solved again"):
+        outputs(seed=1)
+
+
+@pytest.mark.parametrize("text", ["{", "{}"])
+def test_a_broken_cache_entry_is_made_anew(outputs, fresh_cache, text):
+    first = outputs()
+    (report,) = fresh_cache.rglob("kronc.json")
+    whole = report.read_text()
+    report.write_text(text)
+    second = outputs()
+    assert torch.equal(first.cameras.camera_to_worlds, second.cameras.camera_to_worlds)
+    assert json.loads(report.read_text())["points"] == json.loads(whole)["points"]
+
+
+def test_a_processed_folder_is_taken_as_solved_unless_an_option_is_given(changed, solution, config, no_solver):
+    write_solution(changed, load_scene(changed), solution, changed, "inputs")
+    no_solver()
+    output = KroncDataParserConfig(data=changed, background="keep").setup().get_dataparser_outputs(split="all")
+    assert view_numbers(output) == list(range(VIEWS))
+    with pytest.raises(AssertionError, match="solved again"):
+        KroncDataParserConfig(data=changed, seed=99, config=config).setup().get_dataparser_outputs()
+
+
+# ---- splits
+
+
+def test_every_eighth_view_is_for_evaluation(parser):
+    one = parser(background="keep")
+    train, val, test, whole = (
+        view_numbers(one.get_dataparser_outputs(split=s)) for s in ("train", "val", "test", "all")
+    )
+    assert val == test == [0, 8]
+    assert train == [i for i in range(VIEWS) if i % 8]
+    assert sorted(train + val) == whole == list(range(VIEWS))
+
+
+def test_an_evenly_spread_share_is_for_evaluation(outputs):
+    val = view_numbers(outputs("val", eval_fraction=0.25, background="keep"))
+    train = view_numbers(outputs("train", eval_fraction=0.25, background="keep"))
+    assert val == [0, 4, 8, 12]
+    assert sorted(train + val) == list(range(VIEWS))
+
+
+def test_a_view_with_three_keypoints_is_left_out_and_listed(changed, parser, edit, capsys):
+    def thin(content):
+        rows = content["frames"][POOR]["keypoints"]
+        for j in [j for j, row in enumerate(rows) if row[2] > 0][3:]:
+            rows[j] = [0, 0, 0]
+
+    edit(changed / "keypoints.json", thin)
+    one = parser(changed, background="keep")
+    train, val = (view_numbers(one.get_dataparser_outputs(split=s)) for s in ("train", "val"))
+    assert sorted(train + val) == [i for i in range(VIEWS) if i != POOR]
+    assert val == [0, 8], "the split does not shift"
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "15 of 16" in printed
+    assert f"images/frame_{POOR + 1:05d}.png" in printed
+    assert "3 keypoints" in printed
+
+
+# ---- geometry
+
+
+def test_poses_are_the_solutions_moved_and_scaled(outputs, solution):
+    output = outputs("all", scale_factor=2.0)
+    c2w, move, scale = output.cameras.camera_to_worlds, output.dataparser_transform, output.dataparser_scale
+    expected = flip_camera_axes(solution.c2w).float()
+    torch.testing.assert_close(c2w[..., :3], move[:, :3] @ expected[..., :3], atol=1e-5, rtol=0)
+    centres = scale * (expected[..., 3] @ move[:, :3].T + move[:, 3])
+    torch.testing.assert_close(c2w[..., 3], centres, atol=1e-5, rtol=0)
+    middle = output.scene_box.aabb.mean(0)
+    torch.testing.assert_close(middle, torch.zeros(3), atol=1e-5, rtol=0)
+    assert float(c2w[..., 3].norm(dim=-1).max()) == pytest.approx(2.0, rel=1e-5)
+
+
+def test_poses_are_right_handed_with_y_up_and_look_at_the_car(outputs):
+    c2w = outputs("all").cameras.camera_to_worlds
+    right, up, back = c2w[..., :3].unbind(-1)
+    torch.testing.assert_close(torch.linalg.cross(right, up), back, atol=1e-5, rtol=0)
+    assert (up[:, 2] > 0.9).all()
+    towards = -torch.nn.functional.normalize(c2w[..., 3], dim=-1)
+    assert ((-back * towards).sum(-1) > 0.9).all()
+
+
+def test_splits_share_one_world(parser):
+    one = parser()
+    train, val = (one.get_dataparser_outputs(split=s) for s in ("train", "val"))
+    assert train.dataparser_scale == val.dataparser_scale
+    assert torch.equal(train.dataparser_transform, val.dataparser_transform)
+    assert torch.equal(train.scene_box.aabb, val.scene_box.aabb)
+
+
+def test_all_keypoints_lie_inside_the_box(outputs, solution):
+    output = outputs()
+    move, scale = output.dataparser_transform, output.dataparser_scale
+    points = solution.points[solution.points.isfinite().all(-1)].float()
+    points = scale * (points @ move[:, :3].T + move[:, 3])
+    low, high = output.scene_box.aabb
+    assert ((points > low) & (points < high)).all()
+    size = high - low
+    assert size[0] > size[1] > size[2], "a car is longer than wide, and wider than high"
+    twice = outputs(scene_scale=2.0)
+    torch.testing.assert_close(twice.scene_box.aabb, 2 * output.scene_box.aabb, atol=1e-5, rtol=0)
+
+
+def test_intrinsics_and_distortion_are_the_cameras(changed, outputs, edit):
+    edit(changed / "transforms.json", lambda c: c.update(k1=-0.02, k2=0.003, p1=0.001, p2=-0.002))
+    cameras = outputs(data=changed).cameras
+    camera = asdict(load_scene(changed).camera)
+    for name in ("fx", "fy", "cx", "cy", "width", "height"):
+        assert (getattr(cameras, name) == camera[name]).all(), name
+    expected = torch.tensor([-0.02, 0.003, 0.0, 0.0, 0.001, -0.002]).expand(len(cameras), -1)
+    torch.testing.assert_close(cameras.distortion_params, expected)
+
+
+# ---- images
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path))
+
+
+def test_white_background_cuts_the_car_out(rendered, outputs):
+    output = outputs("all")
+    assert output.mask_filenames is None
+    torch.testing.assert_close(output.alpha_color, torch.ones(3))
+    for path, number in zip(output.image_filenames[::5], range(0, VIEWS, 5), strict=True):
+        rgba = pixels(path)
+        name = f"frame_{number + 1:05d}.png"
+        mask = pixels(rendered / "masks" / name)
+        np.testing.assert_array_equal(rgba[..., 3], np.where(mask > 0, 255, 0))
+        np.testing.assert_array_equal(rgba[..., :3], pixels(rendered / "images" / name))
+        assert 0 < (mask > 0).mean() < 1
+
+
+def test_an_images_own_alpha_stays(tmp_path):
+    rgba = np.full((4, 6, 4), 200, dtype=np.uint8)
+    rgba[:, :2, 3] = 90
+    mask = np.zeros((4, 6), dtype=np.uint8)
+    mask[:2] = 255
+    Image.fromarray(rgba).save(tmp_path / "image.png")
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    (copy,) = cut_out([tmp_path / "image.png"], [tmp_path / "mask.png"])
+    expected = np.zeros((4, 6), dtype=np.uint8)
+    expected[:2] = [90, 90, 200, 200, 200, 200]
+    np.testing.assert_array_equal(pixels(copy)[..., 3], expected)
+
+
+def test_masks_that_do_not_fit_are_refused(tmp_path):
+    Image.new("RGB", (6, 4)).save(tmp_path / "image.png")
+    Image.new("L", (4, 6)).save(tmp_path / "mask.png")
+    (tmp_path / "text.png").write_text("no image")
+    with pytest.raises(KroncError, match="expected equal sizes"):
+        cut_out([tmp_path / "image.png"], [tmp_path / "mask.png"])
+    with pytest.raises(KroncError, match=r"text\.png is no image"):
+        cut_out([tmp_path / "image.png"], [tmp_path / "text.png"])
+    with pytest.raises(KroncError, match=r"text\.png is no image"):
+        cut_out([tmp_path / "text.png"], [tmp_path / "mask.png"])
+
+
+def test_masks_and_the_full_frame_go_to_the_method_as_they_are(rendered, outputs):
+    masked = outputs("val", background="mask")
+    kept = outputs("val", background="keep")
+    names = ["frame_00001.png", "frame_00009.png"]
+    assert masked.image_filenames == kept.image_filenames == [rendered / "images" / name for name in names]
+    assert masked.mask_filenames == [rendered / "masks" / name for name in names]
+    assert kept.mask_filenames is None
+    assert kept.alpha_color is None
+
+
+def test_downscaled_images_come_with_their_intrinsics(changed, outputs):
+    for kind in ("images", "masks"):
+        (changed / f"{kind}_2").mkdir()
+        for path in (changed / kind).iterdir():
+            Image.open(path).resize((48, 27), Image.Resampling.NEAREST).save(changed / f"{kind}_2" / path.name)
+    half = outputs(data=changed, downscale_factor=2)
+    full = outputs(data=changed)
+    assert all(Image.open(path).size == (48, 27) for path in half.image_filenames)
+    assert all(Image.open(path).size == (96, 54) for path in full.image_filenames)
+    for name in ("fx", "fy", "cx", "cy", "width", "height"):
+        torch.testing.assert_close(getattr(half.cameras, name) * 2, getattr(full.cameras, name))
+    masks = outputs(data=changed, downscale_factor=2, background="mask").mask_filenames
+    assert all(PurePosixPath(path).parent.name == "masks_2" for path in masks)
+
+
+def test_seed_points_fill_the_box_and_hold_the_keypoints(outputs, solution):
+    output, again = outputs(num_seed_points=700), outputs(num_seed_points=700)
+    points, colours = output.metadata["points3D_xyz"], output.metadata["points3D_rgb"]
+    known = solution.points[solution.points.isfinite().all(-1)]
+    assert len(points) == len(colours) == 700 + len(known)
+    assert colours.dtype == torch.uint8
+    low, high = output.scene_box.aabb
+    assert ((points >= low - 1e-6) & (points <= high + 1e-6)).all()
+    assert ((points.amax(0) - points.amin(0)) > 0.95 * (high - low)).all()
+    move, scale = output.dataparser_transform, output.dataparser_scale
+    keypoints = scale * (known.float() @ move[:, :3].T + move[:, 3])
+    assert torch.cdist(keypoints, points).amin(1).max() < 1e-3
+    assert torch.equal(points, again.metadata["points3D_xyz"])
+
+
+# ---- what a user can get wrong
+
+
+@pytest.fixture
+def refused(parser, capsys):
+    """Exit status 2 and one line on stderr that holds all parts."""
+
+    def check(*parts: str, status: int = 2, **options) -> None:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as caught:
+            parser(**options).get_dataparser_outputs()
+        err = capsys.readouterr().err
+        assert caught.value.code == status
+        assert err.count("\n") == 1
+        for part in parts:
+            assert part in err
+
+    return check
+
+
+def test_poses_nobody_can_trust_are_not_trained_on(refused, place):
+    (place / "hasty.yaml").write_text("adam:\n  steps: 3\n")
+    for _ in range(2):  # solved, then from the cache
+        refused("failed", "px", status=3, config=str(place / "hasty.yaml"))
+
+
+def test_a_loss_that_is_not_finite_ends_as_clearly(refused, place):
+    (place / "wild.yaml").write_text("adam:\n  steps: 20\n  learning_rate: 1.0e+30\n")
+    refused("failed", status=3, config=str(place / "wild.yaml"))
+
+
+def test_a_solution_that_is_not_finite_is_an_error(refused, place):
+    (place / "wilder.yaml").write_text("adam:\n  steps: 20\n  learning_rate: 1.0e+38\n")
+    refused("not finite", "learning_rate", config=str(place / "wilder.yaml"))
+
+
+def test_options_that_cannot_be_are_named(refused, tmp_path):
+    refused("eval_interval is 1", eval_interval=1)
+    refused("eval_fraction is 1.5", eval_fraction=1.5)
+    refused("downscale_factor is 0", downscale_factor=0)
+    refused("images_4", "does not exist", downscale_factor=4)
+    refused("nowhere", data=tmp_path / "nowhere")
+    refused("'nothing'", "phone_walk", config="nothing")
+
+
+def test_missing_images_are_named(refused, changed):
+    shutil.rmtree(changed / "images")
+    refused("images/frame_00002.png", "does not exist", data=changed)
+
+
+def test_a_cache_that_cannot_be_written_is_named(refused, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("KRONC_NS_CACHE", str(tmp_path / "file"))
+    refused("file", "cannot be written")
