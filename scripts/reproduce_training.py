@@ -4,7 +4,6 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 import torch
 import tyro
@@ -24,6 +23,8 @@ class Options:
     views: int = 40
     noise_px: float = 1.0
     """Keypoint noise in the rendered 480x270 frames; training is on half their size."""
+    poses: tuple[Poses, ...] = ("exact", "solved", "circle")
+    """Which poses to train on."""
     seed: int = 0
     iterations: int | None = None
     """Training iterations (default: the method's)."""
@@ -37,7 +38,7 @@ def main(options: Options) -> None:
     add_half_size(data)
     points = torch.from_numpy(capture.car.keypoints)
     extra = [] if options.iterations is None else ["--max-num-iterations", str(options.iterations)]
-    for which in get_args(Poses):
+    for which in options.poses:
         folder = options.output_dir / which
         write_variant(folder, data, which, load_config("phone_walk"), points)
         config = train(folder, options.method, options.output_dir / "runs", extra, ["--downscale-factor", "2"])

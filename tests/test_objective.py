@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from kronc_ns.geometry.camera import Camera, project
