@@ -73,7 +73,9 @@ def main(options: Options) -> None:
     axis.set(title="Keypoints in one view", xticks=[], yticks=[])
     axis.legend(loc="lower right", fontsize=8)
 
-    renders = sorted((options.quickstart / "renders").glob("*.jpg")) or sorted((options.quickstart / "renders").glob("*.png"))
+    renders = sorted((options.quickstart / "renders").glob("*.jpg")) or sorted(
+        (options.quickstart / "renders").glob("*.png")
+    )
     pairs = [path for path in renders if "img" in path.name][1:3]
     for column, path in enumerate(pairs, start=1):
         axis = figure.add_subplot(grid[1, column])

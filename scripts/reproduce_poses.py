@@ -38,11 +38,10 @@ def main(options: Options) -> None:
     print("| setting | seed | views | rotation mean / median (deg) | translation mean / median (cm) | s | steps/s |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name, seed, f in runs:
-        rotation, translation = f["rotation_deg"], f["translation"]
-        print(
-            f"| {name} | {seed} | {f['registered']}/{f['views']} | {rotation['mean']:.4f} / {rotation['median']:.4f} "
-            f"| {100 * translation['mean']:.2f} / {100 * translation['median']:.2f} | {f['seconds']:.1f} | {f['steps_per_s']:.0f} |"
-        )
+        degrees = " / ".join(f"{f['rotation_deg'][which]:.4f}" for which in ("mean", "median"))
+        centimetres = " / ".join(f"{100 * f['translation'][which]:.2f}" for which in ("mean", "median"))
+        views, speed = f"{f['registered']}/{f['views']}", f"{f['seconds']:.1f} | {f['steps_per_s']:.0f}"
+        print(f"| {name} | {seed} | {views} | {degrees} | {centimetres} | {speed} |")
 
 
 if __name__ == "__main__":

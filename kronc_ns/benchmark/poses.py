@@ -33,7 +33,9 @@ class Setting:
 
 
 SETTINGS = (
-    Setting("hemisphere, exact keypoints, from (4 deg, 0.5 m)", "carpatch", 100, "paper_synthetic", pose_noise=(4.0, 0.5)),
+    Setting(
+        "hemisphere, exact keypoints, from (4 deg, 0.5 m)", "carpatch", 100, "paper_synthetic", pose_noise=(4.0, 0.5)
+    ),
     Setting("hemisphere, 1 px, from (4 deg, 0.5 m)", "carpatch", 100, "paper_synthetic", 1.0, pose_noise=(4.0, 0.5)),
     Setting("walk, 2 px, 25 % missing, 3 % outliers, from the circle", "walk", 123, "phone_walk", 2.0, 0.25, 0.03),
 )

@@ -1,4 +1,4 @@
-"""Training, evaluation, rendering and resuming through nerfstudio's own commands, without internet and without a GPU."""
+"""Training, evaluation, rendering and resuming through nerfstudio's own commands, without internet or GPU."""
 
 import json
 import math
