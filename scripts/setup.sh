@@ -16,10 +16,11 @@ kronc_python() {
 
 # ffmpeg reads videos; nerfstudio's imports (open3d, OpenCV) load the others.
 kronc_system_libraries() {
-    local missing=() library
+    local missing=() library known
+    known=$(PATH=$PATH:/sbin:/usr/sbin ldconfig -p 2>/dev/null || true)
     command -v ffmpeg >/dev/null || missing+=(ffmpeg)
     for library in libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libgomp.so.1:libgomp1 libglib-2.0.so.0:libglib2.0-0; do
-        PATH=$PATH:/sbin:/usr/sbin ldconfig -p 2>/dev/null | grep -q "${library%%:*}" || missing+=("${library##*:}")
+        [[ $known == *"${library%%:*}"* ]] || missing+=("${library##*:}")
     done
     [ ${#missing[@]} -eq 0 ] && return
     if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
@@ -37,7 +38,8 @@ kronc_setup() {
     local extra=${1:+[$1]} stamp
     kronc_system_libraries
     stamp="$(cat pyproject.toml scripts/setup.sh | cksum) $extra"
-    if [ -x .venv/bin/python ] && grep -qxF "$stamp" .venv/.kronc-setup 2>/dev/null; then
+    # an installation with extras serves those who need none
+    if [ -x .venv/bin/python ] && grep -qF -- "$stamp" .venv/.kronc-setup 2>/dev/null; then
         return
     fi
     echo "installing kronc_ns and nerfstudio into .venv (several GB, once)"
