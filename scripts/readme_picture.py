@@ -80,7 +80,7 @@ def main(options: Options) -> None:
     for column, path in enumerate(pairs, start=1):
         axis = figure.add_subplot(grid[1, column])
         axis.imshow(np.asarray(Image.open(path)))
-        axis.set(title="Test view: photo | trained", xticks=[], yticks=[])
+        axis.set(title="Test view: truth | trained", xticks=[], yticks=[])
     options.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.output, dpi=110)
 

@@ -6,7 +6,8 @@ preallocated buffers, without a graph: about three times the speed of autograd o
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import torch
@@ -176,6 +177,17 @@ class LossGradient:
         return float((self._weight_3d * norms[0]).sum() + (self._weight_2d * norms[1]).sum())
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one CPU thread: the tensors are too small to share, and idle threads would only spin for the cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def minimise(
     c2w: Float[Tensor, "n 3 4"],
     depths: Float[Tensor, "n j"],
@@ -190,24 +202,6 @@ def minimise(
 
     ``uv`` are undistorted pixels, ``m`` the visibility. ``progress(step, loss)`` is called about a hundred times.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the tensors are too small to share; idle threads would only spin for the cores
-    try:
-        return _minimise(c2w, depths, uv, m, focal, principal, config, progress)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _minimise(
-    c2w: Float[Tensor, "n 3 4"],
-    depths: Float[Tensor, "n j"],
-    uv: Float[Tensor, "n j 2"],
-    m: Float[Tensor, "n j"],
-    focal: tuple[float, float],
-    principal: tuple[float, float],
-    config: AdamConfig,
-    progress: Callable[[int, float], None] | None,
-) -> AdamResult:
     start = time.perf_counter()
     gradient = LossGradient(c2w, depths, uv, m, focal, principal, (config.weight_3d, config.weight_2d))
     optimiser = torch.optim.Adam([gradient.parameters], lr=config.learning_rate, fused=True)
@@ -215,7 +209,7 @@ def _minimise(
     history: dict[str, list[float]] = {"step": [], "loss": []}
     best, best_step, step = math.inf, 0, 0
     floor = config.learning_rate * config.decay
-    with torch.no_grad():
+    with torch.no_grad(), _one_thread():
         for step in range(1, config.steps + 1):
             norms = gradient.evaluate()
             if not config.optimise_depths:
