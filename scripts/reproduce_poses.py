@@ -35,13 +35,18 @@ def main(options: Options) -> None:
             print(json.dumps({"setting": name, "seed": seed, **figures}))
         return
     print(f"one CPU core, {platform.machine()}, torch {torch.__version__}\n")
-    print("| setting | seed | views | rotation mean / median (deg) | translation mean / median (cm) | s | steps/s |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print("| setting | seed | views | rotation mean / median (deg) | centre mean / median (cm) | s | steps/s | best |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for name, seed, f in runs:
         degrees = " / ".join(f"{f['rotation_deg'][which]:.4f}" for which in ("mean", "median"))
         centimetres = " / ".join(f"{100 * f['translation'][which]:.2f}" for which in ("mean", "median"))
         views, speed = f"{f['registered']}/{f['views']}", f"{f['seconds']:.1f} | {f['steps_per_s']:.0f}"
-        print(f"| {name} | {seed} | {views} | {degrees} | {centimetres} | {speed} |")
+        best = ""
+        if "maximum_likelihood" in f:
+            bound = f["maximum_likelihood"]
+            best = f"{bound['rotation_deg']['median']:.3f} deg, {100 * bound['translation']['median']:.2f} cm"
+        print(f"| {name} | {seed} | {views} | {degrees} | {centimetres} | {speed} | {best} |")
+    print("\nbest: median error of the maximum-likelihood solution started from the truth")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from kronc_ns.benchmark.likelihood import maximum_likelihood
 from kronc_ns.config import load_config
 from kronc_ns.evaluate import evaluate_poses
 from kronc_ns.init import noisy_poses
@@ -48,13 +49,20 @@ def capture_scene(capture: Capture, given: torch.Tensor | None = None) -> Scene:
 
 
 def measure(setting: Setting, seed: int) -> dict[str, Any]:
-    """Solve one capture of a setting; the figures of `kronc eval` with seconds and steps per second."""
+    """Solve one capture of a setting: the figures of `kronc eval`, speed, and what the data allow at the best."""
     capture = make_capture(setting.preset, setting.views, seed, setting.noise_px, setting.missing, setting.outliers)
     given = None
     if setting.pose_noise is not None:
         given = noisy_poses(capture.c2w, *setting.pose_noise, torch.Generator().manual_seed(seed))
     scene = capture_scene(capture, given)
-    return _figures(scene, load_config(setting.config, seed=seed), dict(zip(scene.names, capture.c2w, strict=True)))
+    reference = dict(zip(scene.names, capture.c2w, strict=True))
+    figures = _figures(scene, load_config(setting.config, seed=seed), reference)
+    if setting.noise_px:
+        points = torch.from_numpy(capture.car.keypoints)
+        best = maximum_likelihood(scene, capture.c2w, points, robust=setting.outliers > 0)
+        bound = evaluate_poses(dict(zip(scene.names, best, strict=True)), reference).as_dict()
+        figures["maximum_likelihood"] = {key: bound[key] for key in ("rotation_deg", "translation")}
+    return figures
 
 
 def measure_folder(folder: Path, config: KroncConfig) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def make_capture(
     camera = camera or default_camera(preset)
     match preset:
         case "carpatch":
-            c2w = hemisphere_poses(views, 6.0, rng)
+            c2w = hemisphere_poses(views, 6.5, rng)
         case "walk":
             c2w = walk_poses(views, rng)
         case _:
