@@ -1,7 +1,7 @@
 """The scene: everything a solver may know about a capture, read from a scene folder and checked."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -83,9 +83,11 @@ def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
     masks = tuple(str(frame.get("mask_path", "")) for frame in frames)
     if any(masks) and not all(masks):
         raise KroncError(f"{file}: frame {names[masks.index('')]} lacks a mask_path that others have: give all or none")
-    found = read_keypoints(keypoints or folder)
-    rows, note = match_keypoints(found, names, camera, [folder / m for m in masks] if all(masks) and masks else None)
     is_solution = (folder / "kronc.json").exists()
+    found = read_keypoints(keypoints or folder)
+    if is_solution:
+        found = _without(found, left_out_views(folder))
+    rows, note = match_keypoints(found, names, camera, [folder / m for m in masks] if all(masks) and masks else None)
     return Scene(
         names=names,
         camera=camera,
@@ -167,6 +169,21 @@ def match_keypoints(
     read = [_read_mask(path) if i in several else None for i, path in enumerate(masks)] if masks and several else None
     rows, note = select_instances(instances, (camera.width, camera.height), read)
     return rows, note if several else ""
+
+
+def left_out_views(folder: Path) -> set[str]:
+    """File names of the views that a solved folder's transforms.json no longer lists because they failed."""
+    file = folder / "kronc.json"
+    try:
+        views = read_json(file)["views"]
+        return {PurePosixPath(view["file_path"]).name for view in views if view["status"] == "failed"}
+    except (KeyError, TypeError):
+        raise KroncError(f'{file}: expected "views", as `kronc solve` writes them: solve again') from None
+
+
+def _without(found: Detections, file_names: set[str]) -> Detections:
+    kept = {key: rows for key, rows in found.frames.items() if PurePosixPath(key).name not in file_names}
+    return replace(found, frames=kept)
 
 
 def read_poses(file: Path) -> dict[str, Float[Tensor, "3 4"]]:

@@ -39,8 +39,8 @@ class KroncDataParserConfig(SolverOptions, DataParserConfig):
     _target: type = field(default_factory=lambda: KroncDataParser)
     """The dataparser."""
     data: Path = Path()
-    """Scene folder; it is only read. What `ns-process-data kronc` wrote is used as solved unless a solver option is
-    given."""
+    """Scene folder; it is only read. What `ns-process-data kronc` wrote is used as solved unless a solver option or
+    keypoints are given."""
     keypoints: Path | None = None
     """Keypoints from elsewhere: our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON."""
     background: Literal["white", "mask", "keep"] = "white"
@@ -81,7 +81,7 @@ class KroncDataParser(DataParser):
         config = self.config
         scene = load_scene(config.data, config.keypoints)
         report = read_report(config.data)
-        if report is not None and not config.any_solver_option():
+        if report is not None and config.keypoints is None and not config.any_solver_option():
             folder = config.data
         else:
             with progress_bar("solving poses") as progress:
@@ -97,7 +97,10 @@ class KroncDataParser(DataParser):
 
     def _outputs(self, split: str, scene: Scene, poses: dict[str, Tensor], report: dict[str, Any]) -> DataparserOutputs:
         config = self.config
-        test = test_views(len(scene), config.eval_interval, config.eval_fraction)
+        everyone = [PurePosixPath(view["file_path"]).name for view in report["views"]]
+        tested = test_views(len(everyone), config.eval_interval, config.eval_fraction).tolist()
+        is_test = dict(zip(everyone, tested, strict=True))
+        test = torch.tensor([is_test.get(PurePosixPath(name).name, False) for name in scene.names])
         posed = torch.tensor([PurePosixPath(name).name in poses for name in scene.names])
         chosen = {"train": ~test & posed, "val": test & posed, "test": test & posed, "all": posed}.get(split)
         if chosen is None:

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -20,7 +20,7 @@ from kronc_ns.pipeline import solve_scene
 from kronc_ns.plugin.dataparser import KroncDataParser, KroncDataParserConfig
 from kronc_ns.plugin.images import cut_out
 from kronc_ns.scene import load_scene
-from kronc_ns.solve.solution import Solution
+from kronc_ns.solve.solution import Solution, ViewStatus
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
 
@@ -192,6 +192,19 @@ def test_a_view_with_three_keypoints_is_left_out_and_listed(changed, parser, edi
     assert "15 of 16" in printed
     assert f"images/frame_{POOR + 1:05d}.png" in printed
     assert "3 keypoints" in printed
+
+
+def test_a_processed_folder_may_have_left_views_out(changed, solution, no_solver):
+    views = list(solution.views)
+    views[POOR] = replace(views[POOR], status=ViewStatus.FAILED, reason="3 keypoints, at least 4 are needed")
+    c2w = solution.c2w.clone()
+    c2w[POOR] = torch.nan
+    write_solution(changed, load_scene(changed), replace(solution, views=views, c2w=c2w), changed, "inputs")
+    no_solver()
+    one = KroncDataParserConfig(data=changed, background="keep").setup()
+    train, val = (view_numbers(one.get_dataparser_outputs(split=s)) for s in ("train", "val"))
+    assert sorted(train + val) == [i for i in range(VIEWS) if i != POOR]
+    assert val == [0, 8], "the split does not shift"
 
 
 # ---- geometry
