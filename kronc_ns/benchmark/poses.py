@@ -58,7 +58,7 @@ def measure(setting: Setting, seed: int) -> dict[str, Any]:
     reference = dict(zip(scene.names, capture.c2w, strict=True))
     figures = _figures(scene, load_config(setting.config, seed=seed), reference)
     if setting.noise_px:
-        points = torch.from_numpy(capture.car.keypoints)
+        points = capture.points
         best = maximum_likelihood(scene, capture.c2w, points, robust=setting.outliers > 0)
         bound = evaluate_poses(dict(zip(scene.names, best, strict=True)), reference).as_dict()
         figures["maximum_likelihood"] = {key: bound[key] for key in ("rotation_deg", "translation")}

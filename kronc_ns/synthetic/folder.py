@@ -31,11 +31,13 @@ def write_capture(
     depth maps: the whole surroundings with ``ground``, otherwise RGBA of the car alone. ``progress(view)`` is
     called after each image.
     """
+    if render and capture.car is None:
+        raise KroncError("the capture knows keypoints but no car: it can be written only without images")
     claim_output(folder)
     names = [f"images/frame_{i + 1:05d}.png" for i in range(len(capture.c2w))]
     masks = [name.replace("images", "masks") for name in names] if render else None
     depths = [name.replace("images", "depths") for name in names] if render else None
-    if render:
+    if render and capture.car is not None:
         for i, name in enumerate(names):
             camera = capture.camera
             view = render_view(

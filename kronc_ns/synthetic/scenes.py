@@ -14,21 +14,28 @@ from kronc_ns.geometry.camera import Camera, project
 from kronc_ns.geometry.poses import compose, invert, look_at, make_pose, transform
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.synthetic.car import CarModel, CarShape, build_car
+from kronc_ns.synthetic.hull import hull_visibility
 from kronc_ns.synthetic.render import keypoint_visibility
 
 Preset = Literal["carpatch", "walk"]
+HEMISPHERE_RADIUS_M = 6.5
 
 
 @dataclass(frozen=True)
 class Capture:
     """A synthetic capture: the truth, and the detections a solver gets to see."""
 
-    car: CarModel
+    car: CarModel | None
+    """What was captured; None where only its keypoints are known (such a capture cannot be rendered)."""
+    points: Float[Tensor, "j 3"]
+    """True keypoints; the world is the car's frame (x forward, y left, z up, ground z = 0), metres."""
     camera: Camera
     c2w: Float[Tensor, "n 3 4"]
-    """True poses, OpenCV axes; the world is the car's frame (x forward, y left, z up, ground z = 0), metres."""
+    """True poses in that world, OpenCV axes."""
     keypoints: Float[Tensor, "n j 3"]
     """Detections (u, v, confidence)."""
+    wild: Bool[Tensor, "n j"]
+    """Which detections are outliers: nothing but chance relates them to their point."""
 
 
 def default_camera(preset: Preset, width: int | None = None) -> Camera:
@@ -87,11 +94,11 @@ def detect(
     noise_px: float = 0.0,
     missing: float = 0.0,
     outliers: float = 0.0,
-) -> Float[Tensor, "n j 3"]:
+) -> tuple[Float[Tensor, "n j 3"], Bool[Tensor, "n j"]]:
     """Simulated detector: normal pixel noise (per axis), a share of points missed, a share anywhere on the car's box.
 
-    Points outside the image are never seen. Confidence is 1 for every detection: a detector's outliers are sure
-    of themselves.
+    Returns the detections and which of them are outliers. Points outside the image are never seen. Confidence is 1
+    for every detection: a detector's outliers are sure of themselves.
     """
     n, j = visible.shape
     low = torch.where(visible[..., None], uv, torch.inf).amin(1, keepdim=True)
@@ -99,10 +106,35 @@ def detect(
     noise = torch.from_numpy(rng.normal(size=(n, j, 2)))
     anywhere = torch.from_numpy(rng.uniform(size=(n, j, 2)))
     missed, wild = torch.from_numpy(rng.uniform(size=(2, n, j))).unbind(0)
-    detected = torch.where((wild < outliers)[..., None], low + (high - low) * anywhere, uv + noise_px * noise)
+    outlier = wild < outliers
+    detected = torch.where(outlier[..., None], low + (high - low) * anywhere, uv + noise_px * noise)
     size = torch.tensor([camera.width, camera.height], dtype=uv.dtype)
     seen = visible & (missed >= missing) & ((uv >= 0) & (uv < size)).all(-1) & detected.isfinite().all(-1)
-    return torch.cat([torch.where(seen[..., None], detected, 0.0), seen[..., None].to(uv.dtype)], dim=-1)
+    keypoints = torch.cat([torch.where(seen[..., None], detected, 0.0), seen[..., None].to(uv.dtype)], dim=-1)
+    return keypoints, outlier & seen
+
+
+def observe(
+    subject: CarModel | Float[Tensor, "j 3"],
+    c2w: Float[Tensor, "n 3 4"],
+    camera: Camera,
+    rng: np.random.Generator,
+    noise_px: float = 0.0,
+    missing: float = 0.0,
+    outliers: float = 0.0,
+) -> Capture:
+    """A capture of a car (visibility by ray casting) or of bare points (by their convex hull) from given poses."""
+    centres = c2w[..., 3]
+    if isinstance(subject, CarModel):
+        car, points = subject, torch.from_numpy(subject.keypoints)
+        visible = torch.from_numpy(keypoint_visibility(car.mesh, car.keypoints, centres.numpy()))
+    else:
+        car, points = None, subject.double()
+        visible = torch.from_numpy(hull_visibility(points.numpy(), centres.numpy()))
+    in_camera = transform(invert(c2w), points.expand(len(c2w), -1, -1))
+    visible &= in_camera[..., 2] > 0.1
+    keypoints, wild = detect(project(in_camera, camera), visible, camera, rng, noise_px, missing, outliers)
+    return Capture(car, points, camera, c2w, keypoints, wild)
 
 
 def make_capture(
@@ -118,17 +150,11 @@ def make_capture(
     """A car, a trajectory, ray-cast visibility and simulated detections, all drawn from ``seed``."""
     rng = np.random.default_rng(seed)
     car = build_car(shape or CarShape())
-    camera = camera or default_camera(preset)
     match preset:
         case "carpatch":
-            c2w = hemisphere_poses(views, 6.5, rng)
+            c2w = hemisphere_poses(views, HEMISPHERE_RADIUS_M, rng)
         case "walk":
             c2w = walk_poses(views, rng)
         case _:
             assert_never(preset)
-    points = torch.from_numpy(car.keypoints)
-    in_camera = transform(invert(c2w), points.expand(views, -1, -1))
-    visible = torch.from_numpy(keypoint_visibility(car.mesh, car.keypoints, c2w[..., 3].numpy()))
-    visible &= in_camera[..., 2] > 0.1
-    keypoints = detect(project(in_camera, camera), visible, camera, rng, noise_px, missing, outliers)
-    return Capture(car, camera, c2w, keypoints)
+    return observe(car, c2w, camera or default_camera(preset), rng, noise_px, missing, outliers)
