@@ -62,3 +62,20 @@ def prior_depths(
     known = given.isfinite()
     scale = 1.0 if metric or not known.any() else 0.75 * mean_distance(c2w) / float(given[known].median())
     return torch.where(known, given * scale, fallback)
+
+
+def triangulate(
+    c2w: Float[Tensor, "n 3 4"], rays: Float[Tensor, "n j 3"], m: Float[Tensor, "n j"]
+) -> Float[Tensor, "j 3"]:
+    """Points nearest to all the rays (K^-1 (u, v, 1)) that see them; the cameras' mean centre where none does."""
+    direction = torch.nn.functional.normalize(rays, dim=-1) @ c2w[..., :3].transpose(-1, -2)
+    centre = c2w[:, None, :, 3]
+    along = (direction * centre).sum(-1, keepdim=True)
+    # sum of m (I - d d^T), and of the same times the centres; a trace of the identity where rays are parallel
+    weighted = m[..., None] * direction
+    outer = torch.einsum("nja,njb->jab", weighted, direction)
+    count = m.sum(0)
+    identity = torch.eye(3, dtype=c2w.dtype, device=c2w.device)
+    trace = (1e-9 * count + 1e-12)[:, None, None] * identity
+    rhs = m.T @ c2w[..., 3] - (weighted * along).sum(0) + trace[..., 0, :1] * c2w[..., 3].mean(0)
+    return torch.linalg.solve(count[:, None, None] * identity - outer + trace, rhs)

@@ -27,18 +27,22 @@ class Similarity:
         return make_pose(self.rotation @ c2w[..., :3], self.apply(c2w[..., 3]))
 
 
-def umeyama(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Similarity:
-    """Least-squares similarity with ``target ~ apply(source)`` (Umeyama, PAMI 1991, eq. 39-43).
+def umeyama(
+    source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], weight: Float[Tensor, "n"] | None = None
+) -> Similarity:
+    """(Weighted) least-squares similarity with ``target ~ apply(source)`` (Umeyama, PAMI 1991, eq. 39-43).
 
     Coincident source points carry no scale or rotation: the similarity is then a translation.
     """
-    mean_source, mean_target = source.mean(0), target.mean(0)
+    share = (torch.ones_like(source[:, 0]) if weight is None else weight)[:, None]
+    share = share / share.sum()
+    mean_source, mean_target = (share * source).sum(0), (share * target).sum(0)
     centred_source, centred_target = source - mean_source, target - mean_target
-    variance = centred_source.square().sum() / len(source)
+    variance = (share * centred_source.square()).sum()
     if variance <= torch.finfo(source.dtype).tiny:
         identity = torch.eye(3, dtype=source.dtype, device=source.device)
         return Similarity(torch.ones_like(variance), identity, mean_target - mean_source)
-    u, singular, vh = torch.linalg.svd(centred_target.T @ centred_source / len(source))
+    u, singular, vh = torch.linalg.svd(centred_target.T @ (share * centred_source))
     sign = torch.ones_like(singular)
     sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))
     rotation = (u * sign) @ vh

@@ -1,5 +1,7 @@
 """Rotations: the 6D representation of the paper and the exponential map of SO(3)."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,15 +22,20 @@ def rotation_from_r6(r6: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:
 
 def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Matrix of the cross product: ``skew(a) @ b = a x b``."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return torch.stack(rows, dim=-1).reshape(*vector.shape[:-1], 3, 3)
+    generators = torch.zeros(3, 3, 3, dtype=vector.dtype, device=vector.device)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        generators[i, k, j], generators[i, j, k] = 1.0, -1.0
+    return (vector @ generators.view(3, 9)).unflatten(-1, (3, 3))
 
 
 def so3_exp(omega: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Rotation by ``|omega|`` radians about ``omega`` (Rodrigues), smooth through zero."""
-    return torch.linalg.matrix_exp(skew(omega))
+    square = omega.square().sum(-1)[..., None, None]
+    angle = (square + torch.finfo(omega.dtype).tiny).sqrt()  # the root's derivative at zero is not finite
+    cross = skew(omega)
+    sine = torch.sinc(angle / math.pi)  # sin(angle) / angle
+    cosine = torch.sinc(angle / (2 * math.pi)).square() / 2  # (1 - cos(angle)) / angle^2
+    return torch.eye(3, dtype=omega.dtype, device=omega.device) + sine * cross + cosine * (cross @ cross)
 
 
 def so3_log(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:

@@ -6,8 +6,7 @@ preallocated buffers, without a graph: about three times the speed of autograd o
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -15,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from kronc_ns.geometry.rotations import rotation_from_r6, rotation_to_r6
+from kronc_ns.solve.threads import one_thread
 
 _TINY = 1e-12
 
@@ -177,17 +177,6 @@ class LossGradient:
         return float((self._weight_3d * norms[0]).sum() + (self._weight_2d * norms[1]).sum())
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute on one CPU thread: the tensors are too small to share, and idle threads would only spin for the cores."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
 def minimise(
     c2w: Float[Tensor, "n 3 4"],
     depths: Float[Tensor, "n j"],
@@ -209,7 +198,7 @@ def minimise(
     history: dict[str, list[float]] = {"step": [], "loss": []}
     best, best_step, step = math.inf, 0, 0
     floor = config.learning_rate * config.decay
-    with torch.no_grad(), _one_thread():
+    with torch.no_grad(), one_thread():
         for step in range(1, config.steps + 1):
             norms = gradient.evaluate()
             if not config.optimise_depths:

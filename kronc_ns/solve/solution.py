@@ -39,11 +39,13 @@ class ViewReport:
     rmse_px: float | None
     """Root mean square reprojection error of the inliers; None where the view was not solved."""
     sigma_rot_deg: float | None = None
-    """Standard deviation of the rotation, where the solver estimates it."""
+    """Standard deviation of the rotation relative to the object: root of the summed variances of its three axes."""
     sigma_trans_m: float | None = None
-    """Standard deviation of the camera centre, where the solver estimates it."""
+    """Standard deviation of the camera centre relative to the object, likewise of all three axes together."""
     reason: str = ""
     """Why the view is not solved."""
+    swapped: bool = False
+    """Whether left and right were confused in its detections, and put right."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,329 @@
+"""Bundle adjustment with the cameras eliminated: residuals, normal equations and covariance of a batch of scenes.
+
+A camera moves as p -> exp(w) p + v in its own axes, a point as X -> X + d. Only the system of the point coordinates
+(and shared intrinsics) is factorised, 3J + K unknowns, so the cost grows linearly with the views. Nothing fixes the
+gauge. Derivation: docs/solver.md.
+
+Arrays of views and keypoints are planar, [B, N, component, J]: B scenes, N views, J keypoints. The unknowns of the
+reduced system are ordered (x of all points, y of all, z of all, intrinsics).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from typing_extensions import Self
+
+from kronc_ns.geometry.rotations import so3_exp
+
+_BEHIND_PX = 1e4  # residual of a point behind its camera: an outlier to every robust loss
+_NEAR = 1e-6  # smallest z that is "in front", in world units
+_TINY = 1e-12
+
+
+class Batched:
+    """A dataclass of tensors (or of such dataclasses) with the scenes in front."""
+
+    def each(self, function: Callable[..., Tensor], *others: Self) -> Self:
+        """``function`` of every tensor and its counterparts in ``others``."""
+        changes = {}
+        for f in fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, f.name)
+            if isinstance(value, Tensor):
+                changes[f.name] = function(value, *(getattr(other, f.name) for other in others))
+            elif isinstance(value, Batched):
+                changes[f.name] = value.each(function, *(getattr(other, f.name) for other in others))
+        return replace(self, **changes)  # pyright: ignore[reportArgumentType]
+
+    def __getitem__(self, scenes: Int[Tensor, "c"]) -> Self:
+        return self.each(lambda x: x[scenes])
+
+
+@dataclass(frozen=True)
+class ShapePrior:
+    """What is known of the points beforehand: about normal around a mean shape, in the world's own frame.
+
+    Arrays are in the planar order of the reduced system.
+    """
+
+    mean: Float[Tensor, "p"]
+    precision: Float[Tensor, "p p"]
+    """Inverse covariance."""
+    freedom: float = 20.0
+    """Degrees of freedom of the tail (Student t): the fewer, the sooner an unusual shape is believed."""
+
+    @staticmethod
+    def of(mean: Float[Tensor, "j 3"], precision: Float[Tensor, "3j 3j"]) -> "ShapePrior":
+        """Prior from a mean shape and an inverse covariance in the order index = 3 * point + axis."""
+        order = torch.arange(mean.numel(), device=mean.device).view(-1, 3).T.flatten()
+        return ShapePrior(mean.T.flatten(), precision[order][:, order].contiguous())
+
+
+@dataclass(frozen=True)
+class OrbitPrior(Batched):
+    """Expected camera centres, such as those of a smooth walk."""
+
+    centre: Float[Tensor, "b n 3"]
+    sigma: Float[Tensor, "b n"]
+    """Standard deviation per axis; inf where nothing is expected."""
+
+
+@dataclass(frozen=True)
+class Problem(Batched):
+    """What a batch of scenes measured."""
+
+    uv: Float[Tensor, "b n 2 j"]
+    """Undistorted pixels less the principal point, planar."""
+    weight: Float[Tensor, "b n j"]
+    """Weight of each detection's squared error; 0: not seen."""
+    focal: Float[Tensor, "b 2"]
+    shape: ShapePrior | None = None
+    orbit: OrbitPrior | None = None
+    refine: tuple[Literal["focal", "k1"], ...] = ()
+    """Shared intrinsics that are unknown too."""
+    points_known: bool = False
+    """Whether only the cameras are sought (resection)."""
+
+
+@dataclass(frozen=True)
+class State(Batched):
+    """The unknowns of a batch of scenes."""
+
+    rotation: Float[Tensor, "b n 3 3"]
+    """World to camera."""
+    translation: Float[Tensor, "b n 3"]
+    """World to camera."""
+    points: Float[Tensor, "b j 3"]
+    intrinsics: Float[Tensor, "b k"]
+    """As far as `Problem.refine` names them: logarithm of the focal length's factor; k1."""
+
+    @property
+    def c2w(self) -> Float[Tensor, "b n 3 4"]:
+        """Camera poses."""
+        inverse = self.rotation.transpose(-1, -2)
+        return torch.cat([inverse, -inverse @ self.translation[..., None]], dim=-1)
+
+    @staticmethod
+    def of(c2w: Float[Tensor, "b n 3 4"], points: Float[Tensor, "b j 3"], unknown: int = 0) -> "State":
+        """State with the given poses and ``unknown`` intrinsics as the camera has them."""
+        rotation = c2w[..., :3].transpose(-1, -2).contiguous()
+        translation = -(rotation @ c2w[..., 3:])[..., 0]
+        return State(rotation, translation, points, points.new_zeros(len(points), unknown))
+
+
+@dataclass(frozen=True)
+class Residuals(Batched):
+    """Reprojection of every point into every view, planar."""
+
+    plane: Float[Tensor, "b n 2 j"]
+    """Normalised image coordinates before k1."""
+    inverse_z: Float[Tensor, "b n 1 j"]
+    error: Float[Tensor, "b n 2 j"]
+    """Projection minus detection in pixels; 0 where nothing is seen."""
+    norm: Float[Tensor, "b n j"]
+    """Length of the error in pixels times the root of its weight; `_BEHIND_PX` behind the camera."""
+
+
+def focal_of(problem: Problem, state: State) -> Float[Tensor, "b 2"]:
+    """Focal length in pixels, refined or not."""
+    if "focal" in problem.refine:
+        return problem.focal * state.intrinsics[:, problem.refine.index("focal"), None].exp()
+    return problem.focal
+
+
+def residuals(problem: Problem, state: State) -> Residuals:
+    """Reproject all points."""
+    camera = torch.matmul(state.rotation, state.points.transpose(-1, -2)[:, None]) + state.translation[..., None]
+    z = camera[:, :, 2:]
+    behind = z < _NEAR
+    inverse_z = z.clamp_min(_NEAR).reciprocal()
+    plane = camera[:, :, :2] * inverse_z
+    image = plane
+    if "k1" in problem.refine:
+        k1 = state.intrinsics[:, problem.refine.index("k1"), None, None, None]
+        image = plane * (1 + k1 * plane.square().sum(2, keepdim=True))
+    seen = problem.weight > 0
+    error = image * focal_of(problem, state)[:, None, :, None] - problem.uv
+    error = error * (seen[:, :, None] & ~behind)
+    norm = (error.square().sum(2) * problem.weight).sqrt()
+    return Residuals(plane, inverse_z, error, torch.where(behind[:, :, 0] & seen, _BEHIND_PX, norm))
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Normal equations of a batch, the cameras' blocks apart from the points' (and intrinsics')."""
+
+    camera: Float[Tensor, "b n 6 6"]
+    coupling: Float[Tensor, "b n 6 p+1"]
+    """Cameras against the p = 3J + K other unknowns; the last column is the cameras' gradient."""
+    point: Float[Tensor, "b p p"]
+    point_gradient: Float[Tensor, "b p"]
+
+
+def linearise(
+    problem: Problem,
+    state: State,
+    residual: Residuals,
+    weight: Float[Tensor, "b n j"],
+    variance: Float[Tensor, "b"],
+    shape_weight: Float[Tensor, "b"],
+) -> Linearisation:
+    """Gauss-Newton normal equations with IRLS weights (in addition to the detections' own)."""
+    b, n, _, j = residual.plane.shape
+    focal = focal_of(problem, state)[:, None, :, None]
+    root = (weight * problem.weight).sqrt()[:, :, None]
+    scale = root * focal  # [b, n, 2, j]
+    x, y = residual.plane.unbind(2)
+    near = residual.inverse_z[:, :, 0]
+    # rows of both image axes against (w, v): A[b, n, 6, 2, j]
+    a = x.new_empty(b, n, 6, 2, j)
+    xy = x * y
+    torch.neg(xy, out=a[:, :, 0, 0])
+    torch.add(x * x, 1.0, out=a[:, :, 1, 0])
+    torch.neg(y, out=a[:, :, 2, 0])
+    a[:, :, 3, 0] = near
+    a[:, :, 4, 0] = 0.0
+    torch.mul(x, near, out=a[:, :, 5, 0]).neg_()
+    torch.add(y * y, 1.0, out=a[:, :, 0, 1]).neg_()
+    a[:, :, 1, 1] = xy
+    a[:, :, 2, 1] = x
+    a[:, :, 3, 1] = 0.0
+    a[:, :, 4, 1] = near
+    torch.mul(y, near, out=a[:, :, 5, 1]).neg_()
+    a.mul_(scale[:, :, None])
+    error = root * residual.error
+    flat = a.view(b, n, 6, 2 * j)
+    camera = flat @ flat.transpose(-1, -2)
+    camera_gradient = flat @ error.reshape(b, n, 2 * j, 1)
+    if problem.orbit is not None:
+        _add_orbit(problem.orbit, state, variance, camera, camera_gradient[..., 0])
+    if problem.points_known:
+        return Linearisation(camera, camera_gradient, x.new_zeros(b, 0, 0), x.new_zeros(b, 0))
+
+    k = len(problem.refine)
+    size = 3 * j + k
+    # the same rows against the points: B[b, n, 3, 2, j]
+    turn = state.rotation
+    rows = x.new_empty(b, n, 3, 2, j)
+    torch.mul(residual.plane[:, :, None], turn[:, :, 2, :, None, None], out=rows)
+    rows.neg_().add_(turn[:, :, :2].transpose(2, 3)[..., None]).mul_((scale * residual.inverse_z)[:, :, None])
+    coupling = x.new_empty(b, n, 6, size + 1)
+    coupling[..., size:] = camera_gradient
+    mixed = coupling[..., : 3 * j].unflatten(-1, (3, j))
+    torch.mul(a[:, :, :, None, 0], rows[:, :, None, :, 0], out=mixed)
+    mixed.addcmul_(a[:, :, :, None, 1], rows[:, :, None, :, 1])
+    by_point = rows.permute(0, 4, 2, 1, 3).reshape(b, j, 3, 2 * n)
+    error_by_point = error.permute(0, 3, 1, 2).reshape(b, j, 2 * n, 1)
+    point = x.new_zeros(b, size, size)
+    blocks = point[:, : 3 * j, : 3 * j].unflatten(2, (3, j)).unflatten(1, (3, j)).diagonal(dim1=2, dim2=4)
+    blocks.copy_((by_point @ by_point.transpose(-1, -2)).permute(0, 2, 3, 1))
+    gradient = x.new_empty(b, size)
+    gradient[:, : 3 * j] = (by_point @ error_by_point)[..., 0].transpose(1, 2).flatten(1)
+    if k:
+        columns = _intrinsic_columns(problem, residual.plane, scale)  # [b, n, k, 2, j]
+        flat_columns = columns.flatten(3)
+        coupling[..., 3 * j : size] = flat @ flat_columns.transpose(-1, -2)
+        by_column = columns.permute(0, 4, 2, 1, 3).reshape(b, j, k, 2 * n)
+        cross = (by_point @ by_column.transpose(-1, -2)).transpose(1, 2).reshape(b, 3 * j, k)
+        point[:, : 3 * j, 3 * j :] = cross
+        point[:, 3 * j :, : 3 * j] = cross.transpose(1, 2)
+        point[:, 3 * j :, 3 * j :] = (by_column @ by_column.transpose(-1, -2)).sum(1)
+        gradient[:, 3 * j :] = (by_column @ error_by_point)[..., 0].sum(1)
+    if problem.shape is not None:
+        strength = variance * shape_weight
+        point[:, : 3 * j, : 3 * j].addcmul_(strength[:, None, None].expand(b, 3 * j, 1), problem.shape.precision)
+        deviation = state.points.transpose(1, 2).flatten(1) - problem.shape.mean
+        gradient[:, : 3 * j].addcmul_(strength[:, None], deviation @ problem.shape.precision)
+    return Linearisation(camera, coupling, point, gradient)
+
+
+def _add_orbit(
+    orbit: OrbitPrior, state: State, variance: Tensor, camera: Tensor, camera_gradient: Tensor
+) -> None:
+    strength = variance[:, None] / orbit.sigma.square()
+    camera[:, :, 3:, 3:].diagonal(dim1=2, dim2=3).add_(strength[..., None])
+    camera_gradient[:, :, 3:].addcmul_(strength[..., None], orbit_error(orbit, state))
+
+
+def orbit_error(orbit: OrbitPrior, state: State) -> Float[Tensor, "b n 3"]:
+    """Expected minus present camera centre, in camera axes (it grows with the translation)."""
+    return state.translation + (state.rotation @ orbit.centre[..., None])[..., 0]
+
+
+def _intrinsic_columns(problem: Problem, plane: Tensor, scale: Tensor) -> Float[Tensor, "b n k 2 j"]:
+    """Derivatives of the projection by the refined intrinsics, about k1 = 0."""
+    along = scale * plane
+    columns = {"focal": along, "k1": along * plane.square().sum(2, keepdim=True)}
+    return torch.stack([columns[name] for name in problem.refine], dim=2)
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The system left when the cameras are eliminated."""
+
+    whitener: Float[Tensor, "b n 6 6"]
+    """Inverse Cholesky factors of the cameras' blocks."""
+    whitened: Float[Tensor, "b 6n p+1"]
+    """The cameras' rows of the system times ``whitener``; the last column is their gradient."""
+    matrix: Float[Tensor, "b p p"]
+    rhs: Float[Tensor, "b p"]
+
+
+def eliminate_cameras(system: Linearisation, damping: Float[Tensor, "b"]) -> Reduced:
+    """Schur complement of the cameras, with Marquardt's damping on all unknowns."""
+    b, n = system.camera.shape[:2]
+    growth = 1 + damping
+    camera = system.camera.clone()
+    _grow_diagonal(camera, growth[:, None])
+    factor = torch.linalg.cholesky_ex(camera).L
+    whitener = torch.linalg.solve_triangular(factor, torch.eye(6).to(factor), upper=False)
+    whitened = whitener @ system.coupling
+    size = system.point.shape[-1]
+    tall = whitened.view(b, 6 * n, size + 1)
+    point = system.point.clone()
+    _grow_diagonal(point, growth)
+    product = tall[..., :size].transpose(1, 2) @ tall
+    matrix = point.sub_(product[..., :size])
+    return Reduced(whitener, tall, matrix, product[..., size] - system.point_gradient)
+
+
+def _grow_diagonal(matrix: Tensor, growth: Tensor) -> None:
+    """Marquardt: multiply the diagonal in place, and keep it off zero (an unseen point, an empty view)."""
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    diagonal.mul_(growth[..., None]).add_(torch.where(diagonal > _TINY, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Step:
+    """A proposed change of the unknowns."""
+
+    camera: Float[Tensor, "b n 6"]
+    points: Float[Tensor, "b j 3"]
+    intrinsics: Float[Tensor, "b k"]
+
+
+def solve_step(reduced: Reduced, joints: int) -> Step:
+    """Solve for the points, then each camera."""
+    b, size = reduced.rhs.shape
+    factor, trouble = torch.linalg.cholesky_ex(reduced.matrix)
+    change = torch.cholesky_solve(reduced.rhs[..., None], factor)[..., 0] if size else reduced.rhs
+    change = torch.where((trouble == 0)[:, None], change, torch.nan)
+    one = torch.cat([change, change.new_ones(b, 1)], dim=1)[..., None]
+    back = (reduced.whitened @ one).view(b, -1, 6, 1)
+    camera = -(reduced.whitener.mT @ back)[..., 0]
+    points = change[:, : 3 * joints].view(b, 3, -1).transpose(1, 2) if size else change.new_zeros(b, joints, 3)
+    return Step(camera, points, change[:, 3 * joints :])
+
+
+def move(state: State, step: Step) -> State:
+    """The state after a step."""
+    turn = so3_exp(step.camera[..., :3])
+    return State(
+        rotation=turn @ state.rotation,
+        translation=(turn @ state.translation[..., None])[..., 0] + step.camera[..., 3:],
+        points=state.points + step.points,
+        intrinsics=state.intrinsics + step.intrinsics,
+    )

@@ -1,0 +1,297 @@
+"""Robust Levenberg-Marquardt on the reprojection error, for a batch of scenes at once.
+
+Minimised per scene (docs/solver.md): ``sum rho(|r_ij|) + sigma^2 prior``. Robust losses are met by iteratively
+reweighted least squares (IRLS). With the Cauchy loss its scale follows the residuals down, so that a far start
+converges (graduated robustness); at last detections beyond 4.5 sigma are left out and the rest counts in squares, so
+that without outliers the result is the maximum-likelihood one.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from typing_extensions import assert_never
+
+from kronc_ns.solve.bundle import (
+    Batched,
+    Problem,
+    Residuals,
+    State,
+    eliminate_cameras,
+    linearise,
+    move,
+    orbit_error,
+    residuals,
+    solve_step,
+)
+
+_RAYLEIGH_MEDIAN = 1.1774  # median norm of 2D normal noise, in standard deviations per axis
+_CAUCHY_SIGMAS = 3.0
+_HUBER_SIGMAS = 2.0
+_TRIM_SIGMAS = 4.5  # one good detection in 25,000 lies farther out
+_SIGMA_FLOOR_PX = 0.05
+_COARSE = 1e-2  # tolerance of the graduated phase
+_LOOSE = 0.7
+_ROUNDS = 8
+_START_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e9
+
+DEBUG=False
+_ROBUST, _TRIMMED = 0, 1
+
+
+@dataclass(frozen=True)
+class LmConfig:
+    """Parameters of the second-order solver."""
+
+    iterations: int = 200
+    """Most iterations, rejected steps included."""
+    tolerance: float = 1e-6
+    """Converged when a step lowers the cost by less than this share."""
+    loss: Literal["cauchy", "huber", "none"] = "cauchy"
+    """cauchy: outliers lose influence and are left out at last; huber: they count linearly; none: in squares."""
+
+
+@dataclass(frozen=True)
+class LmResult:
+    """Where the solver ended, scene by scene."""
+
+    state: State
+    cost: Float[Tensor, "b"]
+    """Robust cost of the detections and the priors, in units of sigma^2."""
+    sigma_px: Float[Tensor, "b"]
+    """Noise of the inliers per axis."""
+    inlier: Bool[Tensor, "b n j"]
+    shape_weight: Float[Tensor, "b"]
+    """What the shape prior counted at last: 1 for a usual shape, less for an unusual one."""
+    iterations: Int[Tensor, "b"]
+    converged: Bool[Tensor, "b"]
+    history: dict[str, list[float]] = field(default_factory=dict)
+    """"step" and "loss" (root of the mean robust squared error, in pixels) of the first scene."""
+
+
+@dataclass(frozen=True)
+class _Search(Batched):
+    """Everything that changes while a batch is solved; scenes in front, so that it can be thinned out."""
+
+    scene: Int[Tensor, "b"]
+    state: State
+    residual: Residuals
+    sigma: Float[Tensor, "b"]
+    phase: Int[Tensor, "b"]
+    cost: Float[Tensor, "b"]
+    damping: Float[Tensor, "b"]
+    rounds: Int[Tensor, "b"]
+
+
+def adjust(
+    problem: Problem,
+    start: State,
+    config: LmConfig | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> LmResult:
+    """Minimise from ``start``; scenes that converge leave the batch. ``progress(step, loss)`` is optional."""
+    config = config or LmConfig()
+    with torch.no_grad():
+        return _adjust(problem, start, config, progress)
+
+
+def _adjust(
+    problem: Problem, start: State, config: LmConfig, progress: Callable[[int, float], None] | None
+) -> LmResult:
+    whole, scenes = problem, len(problem.uv)
+    counts = _redundancy(problem)
+    residual = residuals(problem, start)
+    sigma = _robust_sigma(problem, residual) * counts
+    search = _Search(
+        scene=torch.arange(scenes, device=problem.uv.device),
+        state=start,
+        residual=residual,
+        sigma=sigma,
+        phase=torch.full((scenes,), _ROBUST, device=problem.uv.device),
+        cost=sigma.new_full((scenes,), math.inf),
+        damping=torch.full_like(sigma, _START_DAMPING),
+        rounds=torch.zeros(scenes, dtype=torch.long, device=problem.uv.device),
+    )
+    search = replace(search, cost=_cost(problem, search, config))
+    final = search
+    steps = torch.zeros(scenes, dtype=torch.long, device=problem.uv.device)
+    converged = torch.zeros(scenes, dtype=torch.bool, device=problem.uv.device)
+    history: dict[str, list[float]] = {"step": [], "loss": []}
+    detections = int((problem.weight[0] > 0).sum())
+    for step in range(1, config.iterations + 1):
+        search, done = _iterate(problem, search, counts, config)
+        steps[search.scene] = step
+        if search.scene[0] == 0:
+            loss = math.sqrt(float(search.cost[0]) / max(detections, 1))
+            history["step"].append(float(step))
+            history["loss"].append(loss)
+            if progress is not None:
+                progress(step, loss)
+        if done.any():
+            converged[search.scene[done]] = True
+            final = _store(final, search, done)
+            keep = torch.nonzero(~done)[:, 0]
+            if not len(keep):
+                break
+            problem, search, counts = problem[keep], search[keep], counts[keep]
+    else:
+        final = _store(final, search, torch.ones_like(search.damping, dtype=torch.bool))
+    norm, sigma = final.residual.norm, final.sigma
+    inlier = (whole.weight > 0) & (norm <= _TRIM_SIGMAS * sigma[:, None, None])
+    return LmResult(
+        state=final.state,
+        cost=final.cost / sigma.square(),
+        sigma_px=sigma,
+        inlier=inlier,
+        shape_weight=_shape_weight(whole, final.state),
+        iterations=steps,
+        converged=converged,
+        history=history,
+    )
+
+
+def _iterate(
+    problem: Problem, search: _Search, counts: Tensor, config: LmConfig
+) -> tuple[_Search, Bool[Tensor, "b"]]:
+    """One damped step of every scene in the batch, and which scenes are finished."""
+    weight = _irls_weight(search, config)
+    variance = search.sigma.square()
+    system = linearise(
+        problem, search.state, search.residual, weight, variance, _shape_weight(problem, search.state)
+    )
+    trial = move(search.state, solve_step(eliminate_cameras(system, search.damping), problem.uv.shape[3]))
+    attempt = replace(search, state=trial, residual=residuals(problem, trial))
+    cost = _cost(problem, attempt, config)
+    better = cost < search.cost  # false for NaN
+    tolerance = torch.where(search.phase == _ROBUST, _COARSE if config.loss == "cauchy" else config.tolerance, config.tolerance)
+    still = (search.cost - cost).abs() <= tolerance * search.cost
+    damping = torch.where(better, search.damping / 10, search.damping * 10).clamp(min=_LEAST_DAMPING)
+    settled = still | (damping > _MOST_DAMPING)
+    if DEBUG: print(float(search.sigma[0]), float(search.phase[0]), float(search.cost[0]), float(cost[0]), float(1-cost[0]/search.cost[0]), float(search.damping[0]), float(trial.points.sub(search.state.points).norm()))
+    search = _choose(better, replace(attempt, cost=cost), search)
+    search = replace(search, damping=damping.clamp(max=_MOST_DAMPING))
+    return _anneal(problem, search, settled, counts, config)
+
+
+def _anneal(
+    problem: Problem, search: _Search, settled: Bool[Tensor, "b"], counts: Tensor, config: LmConfig
+) -> tuple[_Search, Bool[Tensor, "b"]]:
+    """Follow the residuals with the scale of the loss; move settled scenes to their next phase."""
+    robust = search.phase == _ROBUST
+    if not (robust | settled).any():
+        return search, settled
+    shrunk = torch.minimum(search.sigma, _robust_sigma(problem, search.residual) * counts)
+    sigma = torch.where(robust, shrunk, search.sigma)
+    if config.loss != "cauchy":
+        return _with_sigma(problem, search, sigma, search.phase, config), settled
+    done = torch.zeros_like(settled)
+    phase, rounds = search.phase, search.rounds
+    if settled.any():
+        seen, norm = problem.weight > 0, search.residual.norm
+        inlier = seen & (norm <= _TRIM_SIGMAS * sigma[:, None, None])
+        found = inlier.sum((1, 2)).clamp_min(1)
+        spread = (torch.where(inlier, norm.square(), 0.0).sum((1, 2)) / (2 * found)).sqrt() * counts
+        spread = torch.minimum(spread.clamp_min(_SIGMA_FLOOR_PX), shrunk)
+        again = seen & (norm <= _TRIM_SIGMAS * spread[:, None, None])
+        loose = spread < _LOOSE * sigma  # the scale lags far behind the residuals: on with the robust phase
+        phase = torch.where(settled, torch.where(loose, _ROBUST, _TRIMMED), phase)
+        rounds = rounds + settled
+        done = settled & ~robust & ~loose & (again == inlier).all(2).all(1) | (rounds >= _ROUNDS)
+        sigma = torch.where(settled & ~done & (loose | ~robust), spread, sigma)
+    return _with_sigma(problem, replace(search, rounds=rounds), sigma, phase, config), done
+
+
+def _with_sigma(problem: Problem, search: _Search, sigma: Tensor, phase: Tensor, config: LmConfig) -> _Search:
+    search = replace(search, sigma=sigma, phase=phase)
+    return replace(search, cost=_cost(problem, search, config))
+
+
+def _choose(chosen: Bool[Tensor, "b"], yes: _Search, no: _Search) -> _Search:
+    """``yes`` for the chosen scenes, else ``no``."""
+    if bool(chosen.all()):
+        return yes
+    return yes.each(lambda a, b: torch.where(chosen.view(-1, *[1] * (a.ndim - 1)), a, b), no)
+
+
+def _store(final: _Search, search: _Search, chosen: Bool[Tensor, "b"]) -> _Search:
+    """``final`` (all scenes) with the chosen scenes of ``search`` (those still in the batch)."""
+    if len(search.scene) == len(final.scene) and bool(chosen.all()):
+        return search
+    return final.each(lambda a, b: a.index_copy(0, search.scene[chosen], b[chosen]), search)
+
+
+def _robust_sigma(problem: Problem, residual: Residuals) -> Float[Tensor, "b"]:
+    """Noise per axis from the median of all residuals."""
+    norm = torch.where(problem.weight > 0, residual.norm, math.nan).flatten(1)
+    return (norm.nanmedian(dim=1).values / _RAYLEIGH_MEDIAN).nan_to_num(1.0).clamp_min(_SIGMA_FLOOR_PX)
+
+
+def _redundancy(problem: Problem) -> Float[Tensor, "b"]:
+    """Factor from the spread of residuals to that of the detections: the unknowns take up part of the noise."""
+    seen = problem.weight > 0
+    views, points = seen.any(2).sum(1), (seen.sum(1) > 1).sum(1)
+    unknown = 6 * views + (0 if problem.points_known else 3 * points - 7)
+    measured = 2 * seen.sum((1, 2)).clamp_min(1)
+    return ((measured / (measured - unknown).clamp_min(0)).sqrt()).to(problem.uv.dtype).clamp(max=1.6)
+
+
+def _irls_weight(search: _Search, config: LmConfig) -> Float[Tensor, "b n j"]:
+    norm, sigma = search.residual.norm, search.sigma[:, None, None]
+    match config.loss:
+        case "cauchy":
+            robust = 1 / (1 + (norm / (_CAUCHY_SIGMAS * sigma)).square())
+            trimmed = (norm <= _TRIM_SIGMAS * sigma).to(norm.dtype)
+            return torch.where(search.phase[:, None, None] == _ROBUST, robust, trimmed)
+        case "huber":
+            return (_HUBER_SIGMAS * sigma / norm.clamp_min(1e-12)).clamp(max=1.0)
+        case "none":
+            return torch.ones_like(norm)
+        case _:
+            assert_never(config.loss)
+
+
+def _cost(problem: Problem, search: _Search, config: LmConfig) -> Float[Tensor, "b"]:
+    """What is minimised, in squared pixels."""
+    norm, sigma = search.residual.norm, search.sigma[:, None, None]
+    square = norm.square()
+    match config.loss:
+        case "cauchy":
+            scale = (_CAUCHY_SIGMAS * sigma).square()
+            robust = scale * torch.log1p(square / scale)
+            trimmed = torch.minimum(square, (_TRIM_SIGMAS * sigma).square())
+            value = torch.where(search.phase[:, None, None] == _ROBUST, robust, trimmed)
+        case "huber":
+            knee = _HUBER_SIGMAS * sigma
+            value = torch.where(norm <= knee, square, 2 * knee * norm - knee.square())
+        case "none":
+            value = square
+        case _:
+            assert_never(config.loss)
+    cost = value.sum((1, 2))
+    if problem.shape is not None and not problem.points_known:
+        freedom, size = problem.shape.freedom, search.state.points[0].numel()
+        square = _mahalanobis(problem, search.state)
+        tail = size + (freedom + size) * ((freedom + square.clamp_min(size)) / (freedom + size)).log()
+        cost = cost + search.sigma.square() * torch.where(square <= size, square, tail)
+    if problem.orbit is not None:
+        error = orbit_error(problem.orbit, search.state).square().sum(-1) / problem.orbit.sigma.square()
+        cost = cost + search.sigma.square() * error.sum(1)
+    return cost
+
+
+def _mahalanobis(problem: Problem, state: State) -> Float[Tensor, "b"]:
+    assert problem.shape is not None
+    deviation = state.points.transpose(1, 2).flatten(1) - problem.shape.mean
+    return ((deviation @ problem.shape.precision) * deviation).sum(1)
+
+
+def _shape_weight(problem: Problem, state: State) -> Float[Tensor, "b"]:
+    """IRLS weight of the shape prior: 1 for a usual shape, falling like a Student t's for an unusual one."""
+    if problem.shape is None or problem.points_known:
+        return state.points.new_ones(len(state.points))
+    freedom = problem.shape.freedom
+    return ((freedom + state.points[0].numel()) / (freedom + _mahalanobis(problem, state))).clamp(max=1.0)

@@ -1,0 +1,75 @@
+"""How well each camera is known relative to the points: covariance of a bundle adjustment without a fixed gauge."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from kronc_ns.geometry.rotations import skew
+from kronc_ns.solve.bundle import Problem, State, eliminate_cameras, linearise, residuals
+
+
+def camera_covariance(
+    problem: Problem,
+    state: State,
+    inlier: Bool[Tensor, "b n j"],
+    sigma_px: Float[Tensor, "b"],
+    shape_weight: Float[Tensor, "b"],
+) -> Float[Tensor, "b n 6 6"]:
+    """Covariance of each camera's (rotation vector in radians, centre) in its own axes, the points held still.
+
+    Still means: no common shift, turn or growth of the points that are seen (inner constraints; docs/solver.md), so
+    what remains is the camera's error relative to the object. Cameras without detections get what the system knows of
+    them: nothing (a huge covariance).
+    """
+    b, n, j = inlier.shape
+    size = 3 * j + len(problem.refine)
+    system = linearise(
+        problem, state, residuals(problem, state), inlier.to(problem.weight.dtype), sigma_px.square(), shape_weight
+    )
+    reduced = eliminate_cameras(system, torch.full_like(sigma_px, 1e-9))
+    seen = (inlier & (problem.weight > 0)).any(1)
+    gauge, motion = _gauge(state, seen, size)
+    # any generalised inverse will do, since the gauge is projected out below; a stiff spring makes the matrix regular
+    stiffness = reduced.matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
+    matrix = reduced.matrix + stiffness * (gauge @ gauge.transpose(1, 2))
+    factor = torch.linalg.cholesky_ex(matrix).L
+    # camera = -F (points), with the gauge's part of the points' error taken off points and camera alike
+    follow = -(reduced.whitener.mT @ reduced.whitened[..., :size].view(b, n, 6, size))
+    relative = follow - motion @ gauge.transpose(1, 2)[:, None]
+    spread = torch.linalg.solve_triangular(factor, relative.reshape(b, 6 * n, size).mT, upper=False)
+    spread = spread.mT.reshape(b, n, 6, size)
+    own = reduced.whitener.mT @ reduced.whitener
+    covariance = (own + spread @ spread.mT) * sigma_px.square()[:, None, None, None]
+    # the centre moves by -v (in camera axes) when the translation grows by v
+    sign = covariance.new_tensor([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
+    return covariance * sign[:, None] * sign
+
+
+def _gauge(
+    state: State, seen: Bool[Tensor, "b j"], size: int
+) -> tuple[Float[Tensor, "b p 7"], Float[Tensor, "b n 6 7"]]:
+    """Orthonormal directions in which shift, turn and growth move the seen points, and what each does to a camera."""
+    b, j = seen.shape
+    dtype, identity = state.points.dtype, torch.eye(3, dtype=state.points.dtype, device=state.points.device)
+    weight = seen.to(dtype)[..., None]
+    mean = (state.points * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1)
+    arm = (state.points - mean) * weight
+    shift = identity * weight[..., None]
+    turn = -skew(arm)
+    moves = torch.cat([shift, turn, arm[..., None]], dim=-1)  # [b, j, 3, 7]
+    flat = torch.zeros(b, size, 7, dtype=dtype, device=state.points.device)
+    flat[:, : 3 * j] = moves.transpose(1, 2).flatten(1, 2)
+    basis, upper = torch.linalg.qr(flat)
+    # What leaves all images as they are when the world shifts by s, turns by w and grows by g about the mean m:
+    # with a = R m + t the camera turns by -R w and moves by g a - [a] R w - R s, all in camera axes.
+    at = state.rotation @ mean[..., None] + state.translation[..., None]
+    turned = -state.rotation
+    moved = torch.cat(
+        [
+            torch.cat([torch.zeros_like(turned), turned, torch.zeros_like(at)], dim=-1),
+            torch.cat([-state.rotation, -skew(at[..., 0]) @ state.rotation, at], dim=-1),
+        ],
+        dim=-2,
+    )
+    # flat = basis upper, so coefficients of the basis are upper times those of the moves
+    return basis, moved @ torch.linalg.pinv(upper)[:, None]

@@ -1,0 +1,127 @@
+"""What a solution is worth: residuals, a report on every view, an overall status with its reason."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from kronc_ns import objective
+from kronc_ns.adjustment import MIN_POINTS
+from kronc_ns.scene import Scene
+from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
+
+MIN_VIEWS = 3
+INLIER_SIGMAS = 5.0
+"""A detection counts as inlier up to this many robust standard deviations of all residuals."""
+POOR_FIT = 0.01
+"""A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
+_VAGUE_DEG = 5.0
+"""A median standard deviation of the rotations above this is close to degenerate."""
+_ODD_SHAPE = 0.25
+"""Weight of the shape prior below which the solved points hardly look like a car."""
+
+
+def residuals_px(scene: Scene, solution: Solution) -> Float[Tensor, "n j"]:
+    """Reprojection error of every detection against the solved points; NaN where there is none, inf behind a camera."""
+    c2w, points = solution.c2w, solution.points
+    uv = objective.reproject(points, c2w, solution.camera)
+    error = (uv - scene.uv).norm(dim=-1)
+    z = ((points - c2w[:, None, :, 3]) * c2w[:, None, :, 2]).sum(-1)
+    error = torch.where(z > 0, error, torch.inf)
+    known = (scene.visibility > 0) & c2w.isfinite().all(-1).all(-1)[:, None] & points.isfinite().all(-1)
+    return torch.where(known, error, math.nan)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the solver knows beside poses and points."""
+
+    sigma_rot_deg: Float[Tensor, "n"]
+    sigma_trans_m: Float[Tensor, "n"]
+    swapped: Bool[Tensor, "n"]
+    shape_weight: float | None
+    """How usual a car the points make, 1 to 0; None without a template."""
+
+
+def inliers(scene: Scene, solution: Solution) -> tuple[Float[Tensor, "n j"], Bool[Tensor, "n j"]]:
+    """Residuals as `residuals_px` gives them, and which of them are as small as the detector's noise explains."""
+    error = residuals_px(scene, solution)
+    measured = error[error.isfinite()]
+    diagonal = math.hypot(scene.camera.width, scene.camera.height)
+    # the norm of 2D normal noise has its median at 1.177 sigma; never below a tenth of a pixel
+    sigma = max(float(measured.median()) / 1.177, 0.1) if len(measured) else math.inf
+    return error, error <= min(INLIER_SIGMAS * sigma, POOR_FIT * 3 * diagonal)
+
+
+def verify(scene: Scene, solution: Solution, evidence: Evidence) -> tuple[list[ViewReport], Status, str, float, float]:
+    """A report on every view, the overall status and its reason, RMSE of inliers and median residual in pixels."""
+    error, inlier = inliers(scene, solution)
+    seen, found = (~error.isnan()).sum(1), scene.visibility.sum(1)
+    good = inlier.sum(1)
+    rmse = (torch.where(inlier, error.square(), 0.0).sum(1) / good).sqrt()
+    reports = []
+    for i, name in enumerate(scene.names):
+        reason = _doubt(int(found[i]), int(seen[i]), int(good[i]))
+        if reason:
+            reports.append(ViewReport(name, ViewStatus.FAILED, int(found[i]), int(good[i]), None, reason=reason))
+            continue
+        reports.append(
+            ViewReport(
+                name,
+                ViewStatus.SOLVED,
+                int(found[i]),
+                int(good[i]),
+                float(rmse[i]),
+                _known(evidence.sigma_rot_deg[i]),
+                _known(evidence.sigma_trans_m[i]),
+                swapped=bool(evidence.swapped[i]),
+            )
+        )
+    solved = torch.tensor([report.status is ViewStatus.SOLVED for report in reports])
+    kept = inlier & solved[:, None]
+    median = float(error[solved].nanmedian()) if solved.any() else math.nan
+    total = float((torch.where(kept, error.square(), 0.0).sum() / kept.sum().clamp_min(1)).sqrt())
+    measured = error[error.isfinite()]
+    overall = float(measured.median()) if len(measured) else math.inf
+    status, reason = _judge(scene, solved, overall, evidence)
+    return reports, status, reason, total, median
+
+
+def _known(value: Tensor) -> float | None:
+    return float(value) if value.isfinite() else None
+
+
+def _doubt(found: int, seen: int, good: int) -> str:
+    """Why a view is not solved, or nothing."""
+    if found < MIN_POINTS:
+        return f"{found} keypoints, at least {MIN_POINTS} are needed"
+    if good < MIN_POINTS or 2 * good < seen:
+        return f"only {good} of {seen} keypoints agree with the other views"
+    return ""
+
+
+def _judge(scene: Scene, solved: Bool[Tensor, "n"], median_px: float, evidence: Evidence) -> tuple[Status, str]:
+    share = median_px / math.hypot(scene.camera.width, scene.camera.height)
+    count, views = int(solved.sum()), len(scene)
+    fit = f"median reprojection error {median_px:.2f} px ({100 * share:.2f} % of the image diagonal)"
+    if count == 0 or (count < MIN_VIEWS and evidence.shape_weight is None):
+        return Status.FAILED, f"{count} of {views} views agree with each other, expected at least {MIN_VIEWS}; {fit}"
+    if share > POOR_FIT:
+        return Status.FAILED, f"the keypoints do not fit together: {fit}, expected below {100 * POOR_FIT:g} %"
+    vague = float(evidence.sigma_rot_deg[solved].nanmedian())
+    problems = []
+    if count < MIN_VIEWS:
+        problems.append(f"only {count} views: nothing but the car template holds them together")
+    if share > POOR_FIT / 2:
+        problems.append("the keypoints fit poorly")
+    if 2 * count < views:
+        problems.append(f"only {count} of {views} views are solved")
+    if not vague <= _VAGUE_DEG:
+        problems.append(f"the views are barely determined (median standard deviation {vague:.1f} deg): take more views")
+    if evidence.shape_weight is not None and evidence.shape_weight < _ODD_SHAPE:
+        problems.append("the points hardly look like a car: are the keypoints in the schema's order?")
+    if problems:
+        return Status.WEAK, f"{'; '.join(problems)}; {fit}"
+    return Status.CONVERGED, f"{count} of {views} views solved; {fit}"
