@@ -1,0 +1,123 @@
+"""Bundle adjustment by pycolmap (Ceres): from the truth the yardstick of the tables, from a noisy start a peer."""
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from kronc_ns.errors import KroncError
+from kronc_ns.geometry.camera import rays
+from kronc_ns.geometry.poses import invert
+from kronc_ns.scene import Scene
+
+Loss = Literal["trivial", "cauchy"]
+LinearSolver = Literal["auto", "DENSE_SCHUR", "SPARSE_NORMAL_CHOLESKY", "ITERATIVE_SCHUR"]
+_LOSS_SCALE_PX = 2.0  # residuals well above this lose weight (Cauchy)
+_LEAST_POINTS = 4  # a view with fewer keypoints has no pose of its own
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Where bundle adjustment ended."""
+
+    c2w: Float[Tensor, "n 3 4"]
+    """Poses; NaN where a view has too few keypoints to have one."""
+    points: Float[Tensor, "j 3"]
+    """Keypoints; NaN where fewer than two views see one."""
+    focal_px: float
+    seconds: float
+    """Time of the adjustment alone, without building pycolmap's model of the scene."""
+    converged: bool
+
+
+def triangulate(scene: Scene, c2w: Float[Tensor, "n 3 4"], used: Bool[Tensor, "n j"]) -> Float[Tensor, "j 3"]:
+    """The point nearest to all rays to each keypoint, in the least-squares sense; a linear system a point."""
+    direction = torch.nn.functional.normalize(rays(scene.uv, scene.camera), dim=-1) @ c2w[..., :3].transpose(-1, -2)
+    across = torch.eye(3, dtype=c2w.dtype) - direction[..., :, None] * direction[..., None, :]
+    across = torch.where(used[..., None, None], across, 0.0)
+    return torch.linalg.lstsq(across.sum(0), (across @ c2w[:, None, :, 3:]).sum(0)).solution[..., 0]
+
+
+def bundle_adjustment(
+    scene: Scene,
+    c2w: Float[Tensor, "n 3 4"],
+    points: Float[Tensor, "j 3"] | None = None,
+    used: Bool[Tensor, "n j"] | None = None,
+    loss: Loss = "trivial",
+    refine_focal: bool = False,
+    function_tolerance: float = 0.0,
+    linear_solver: LinearSolver = "auto",
+) -> Adjustment:
+    """Minimise the reprojection error of the detections ``used`` from poses ``c2w`` and ``points`` (or triangulated).
+
+    Free gauge, one focal length, everything else as pycolmap has it by default (Levenberg-Marquardt, a gradient
+    tolerance of 1e-4, at most 100 steps); Ceres' own default for ``function_tolerance`` is 1e-6.
+    """
+    import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
+
+    import pycolmap
+
+    used = (scene.visibility > 0) if used is None else used & (scene.visibility > 0)
+    used = used & (used.sum(1, keepdim=True) >= _LEAST_POINTS)
+    used = used & (used.sum(0) >= 2)
+    points = triangulate(scene, c2w, used) if points is None else points
+    model = _model(scene, c2w, points, used)
+    options = pycolmap.BundleAdjustmentOptions()
+    if not hasattr(options, "ceres"):
+        raise KroncError(f"pycolmap {pycolmap.__version__} is too old for the benchmark: pip install 'pycolmap>=4.1'")
+    options.refine_focal_length = refine_focal
+    options.refine_extra_params = False
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType(loss.upper())
+    options.ceres.loss_function_scale = _LOSS_SCALE_PX
+    options.ceres.solver_options.function_tolerance = function_tolerance
+    if linear_solver != "auto":  # COLMAP chooses by the number of views
+        options.ceres.auto_select_solver_type = False
+        solver = options.ceres.solver_options
+        solver.linear_solver_type = type(solver.linear_solver_type)(linear_solver)
+    config = pycolmap.BundleAdjustmentConfig()  # pycolmap.bundle_adjustment would fix two cameras as the gauge
+    for view in model.images:
+        config.add_image(view)
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.ERROR.value
+    try:  # a start far off makes Ceres warn of every singular step it goes on to damp
+        start = time.perf_counter()
+        summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        seconds = time.perf_counter() - start
+    finally:
+        pycolmap.logging.minloglevel = level
+
+    posed, known = used.any(1), used.any(0)
+    adjusted = torch.full_like(c2w, torch.nan)
+    w2c = [model.images[int(i) + 1].cam_from_world().matrix() for i in torch.nonzero(posed)]
+    adjusted[posed] = invert(torch.stack([torch.from_numpy(pose) for pose in w2c]).to(c2w))
+    world = torch.full_like(points, torch.nan)
+    xyz = [torch.from_numpy(model.points3D[int(j) + 1].xyz) for j in torch.nonzero(known)]
+    world[known] = torch.stack(xyz).to(points)
+    converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
+    return Adjustment(adjusted, world, float(model.cameras[1].params[0]), seconds, converged)
+
+
+def _model(scene: Scene, c2w: Tensor, points: Tensor, used: Tensor) -> Any:
+    """pycolmap's model: image i + 1 has all J keypoints, those that are used observe point j + 1."""
+    import pycolmap
+
+    camera = scene.camera
+    model = pycolmap.Reconstruction()
+    intrinsics = [camera.fx, camera.cx, camera.cy]  # one focal length, as our scenes have
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            camera_id=1, model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=intrinsics
+        )
+    )
+    uv, w2c = scene.uv.double().numpy(), invert(c2w).double().numpy()
+    for i in torch.nonzero(used.any(1))[:, 0].tolist():
+        image = pycolmap.Image(name=scene.names[i], keypoints=uv[i], camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(w2c[i]))
+    for j in torch.nonzero(used.any(0))[:, 0].tolist():
+        model.add_point3D_with_id(j + 1, pycolmap.Point3D(xyz=points[j].double().numpy()))
+    for i, j in torch.nonzero(used).tolist():
+        model.add_observation(j + 1, pycolmap.TrackElement(i + 1, j))
+    return model
