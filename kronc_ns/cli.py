@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from kronc_ns.benchmark.command import Bench
 from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
 from kronc_ns.errors import KroncError
@@ -164,6 +165,7 @@ Command = (
     Annotated[Solve, tyro.conf.subcommand("solve")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Export, tyro.conf.subcommand("export")]
 )
 

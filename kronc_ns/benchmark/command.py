@@ -1,0 +1,84 @@
+"""`kronc bench`: measure the tables on this machine."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from typing_extensions import assert_never
+
+from kronc_ns.console import progress_bar
+from kronc_ns.errors import KroncError
+
+
+@dataclass(kw_only=True)
+class Bench:
+    """Measure accuracy (poses) or time and memory (speed) on synthetic captures, beside what is asked of each row."""
+
+    suite: Literal["poses", "speed"] = "poses"
+    """poses: errors beside those of the best that the data allow; speed: time and memory beside other solvers'."""
+    seeds: int | None = None
+    """Number of seeds of every row (default: what the row asks for)."""
+    first_seed: int = 0
+    """First seed; from 100 on they are those the solver was tuned on."""
+    rows: str = ""
+    """Only rows whose name holds this text."""
+    shapes: Path | None = None
+    """JSON file of 66 keypoints of real cars for the rows without initial pose; those after the 40th are measured.
+    Default: random procedural cars."""
+    adam_seeds: int | None = None
+    """On so many seeds 10,000 steps of Adam run beside (default: none in poses, 1 in speed); half a minute each."""
+    scenes: int = 200
+    """Scenes of the throughput row."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Measure and print; status 0 also where a row misses what is asked."""
+        # a second of imports that no other command needs
+        from kronc_ns.benchmark.problems import Options, Shapes, load_shapes
+        from kronc_ns.benchmark.rows import hardware, measure_rows
+        from kronc_ns.benchmark.table import rows_table
+
+        self._check()
+        shapes = Shapes() if self.shapes is None else load_shapes(self.shapes)
+        options = Options(shapes, self.first_seed, self.adam_seeds or 0, self.scenes)
+        match self.suite:
+            case "poses":
+                from kronc_ns.benchmark.pose_rows import pose_tasks
+
+                tasks = pose_tasks(options)
+            case "speed":
+                from kronc_ns.benchmark.speed_rows import speed_tasks
+
+                tasks = speed_tasks(options)
+            case _:
+                assert_never(self.suite)
+        chosen = [task for task in tasks if self.rows.lower() in task.name.lower()]
+        if not chosen:
+            raise KroncError(f"--rows {self.rows!r}: expected part of one of {'; '.join(task.name for task in tasks)}")
+        machine = hardware()
+        measured = []
+        with progress_bar(self.suite) as progress:
+            for row in measure_rows(chosen, self.first_seed, self.seeds, lambda _, i, n: progress(i, n, None)):
+                measured.append(row)
+                verdict = {True: "reached", False: "missed", None: "measured"}[row.passed]
+                print(f"{verdict}: {row.name} ({row.seconds:.1f} s)", file=sys.stderr)
+        if self.json:
+            content = {"suite": self.suite, "hardware": machine, "rows": [row.as_dict() for row in measured]}
+            print(json.dumps(content, allow_nan=False))
+            return 0
+        asked = [row for row in measured if row.passed is not None]
+        title = f"{self.suite}: {sum(bool(row.passed) for row in asked)} of {len(asked)} rows reached"
+        Console().print(rows_table(measured, title))
+        print(", ".join(f"{name} {value}" for name, value in machine.items()))
+        return 0
+
+    def _check(self) -> None:
+        least = {"--seeds": (self.seeds, 1), "--first-seed": (self.first_seed, 0), "--scenes": (self.scenes, 2)}
+        least["--adam-seeds"] = (self.adam_seeds, 0)
+        for name, (value, minimum) in least.items():
+            if value is not None and value < minimum:
+                raise KroncError(f"{name} is {value}: expected {minimum} or more")
