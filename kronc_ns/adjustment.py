@@ -71,6 +71,8 @@ class Attempt:
     iterations: int
     converged: bool
     history: dict[str, list[float]]
+    choice: str = ""
+    """Why this start was preferred to others."""
 
     @property
     def agreeing(self) -> Bool[Tensor, "n"]:
@@ -131,7 +133,7 @@ def circles(scene: Scene, config: KroncConfig) -> list[Start]:
         kinds += [(way, laps) for laps in _ALL_LAPS for way in ways if (way, laps) != kinds[0]]
     return [
         start_from_poses(
-            f"circular ({way}, {laps:g} lap{'s' if laps > 1 else ''})",
+            "circular" if config.init == "circular" else f"circular ({way}, {laps:g} lap{'s' if laps > 1 else ''})",
             scene,
             circular_poses(len(scene), config.radius_m, way, laps),
         )
@@ -194,9 +196,7 @@ def _run(
     ]
 
 
-def _problem(
-    starts: list[Start], views: int, refine: tuple, prior: ShapePrior | None
-) -> tuple[Problem, State]:
+def _problem(starts: list[Start], views: int, refine: tuple, prior: ShapePrior | None) -> tuple[Problem, State]:
     """The batch of all starts, views padded by unseen ones."""
     joints = len(starts[0].scene.schema)
     uv = torch.zeros(len(starts), views, 2, joints, dtype=torch.float64)

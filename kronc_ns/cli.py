@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from kronc_ns.batch import expand, solve_folders
 from kronc_ns.benchmark.command import Bench
 from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
@@ -26,25 +27,32 @@ from kronc_ns.synthetic.scenes import default_camera, make_capture
 
 @dataclass(kw_only=True)
 class Solve(SolverOptions):
-    """Find the camera poses of a scene folder (transforms.json with intrinsics, keypoints.json)."""
+    """Find the camera poses of scene folders (transforms.json with intrinsics, keypoints.json)."""
 
-    data: Path
-    """Scene folder."""
+    data: tuple[Path, ...]
+    """Scene folder; several (or a quoted pattern such as 'captures/*') are solved together."""
     output_dir: Path
-    """New or empty folder, or one with an earlier result; gets transforms.json, kronc.json and keypoints.ply."""
+    """New or empty folder, or one with an earlier result; gets transforms.json, kronc.json and keypoints.ply. Of
+    several scenes each gets a folder of its name in it."""
     keypoints: Path | None = None
-    """Keypoints from elsewhere: our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON."""
+    """Keypoints from elsewhere (of a single scene): our keypoints.json, a folder of OpenPifPaf *.predictions.json, or
+    COCO JSON."""
 
     def run(self) -> int:
         """Solve and write."""
         config = self.solver_config()
-        scene = load_scene(self.data, self.keypoints)
-        if self.output_dir.resolve() == self.data.resolve():
+        folders = expand(self.data)
+        if len(folders) > 1:
+            if self.keypoints is not None:
+                raise KroncError(f"--keypoints {self.keypoints} with {len(folders)} scenes: expected a single scene")
+            return solve_folders(folders, self.output_dir, config)
+        scene = load_scene(folders[0], self.keypoints)
+        if self.output_dir.resolve() == folders[0].resolve():
             raise KroncError(f"--output-dir {self.output_dir} is the scene itself: choose another folder")
         claim_output(self.output_dir)
         with progress_bar("solving") as progress:
             solution = solve_scene(scene, config, progress)
-        report = write_solution(self.output_dir, scene, solution, self.data, fingerprint(scene, config))
+        report = write_solution(self.output_dir, scene, solution, folders[0], fingerprint(scene, config))
         Console().print(report_table(report, scene.notes))
         print(f"{self.output_dir / 'transforms.json'}")
         return exit_status(report)

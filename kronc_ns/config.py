@@ -3,12 +3,14 @@
 from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
+import tyro
 import yaml
 
 from kronc_ns.errors import KroncError
-from kronc_ns.pipeline import KroncConfig
+from kronc_ns.options import InitChoice, KroncConfig, MinStatus, Solver
 
 
 def preset_folder() -> Path:
@@ -45,22 +47,35 @@ def load_config(name_or_path: str | None = None, **overrides: Any) -> KroncConfi
     return replace(config, **{key: value for key, value in overrides.items() if value is not None})
 
 
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+"""Given or not; there is no --no-... form."""
+
+
 @dataclass(kw_only=True)
 class SolverOptions:
     """The options every command that solves has in common; those left out come from the preset, then the defaults."""
 
     config: str | None = None
     """Preset (paper_synthetic, paper_real, phone_walk, turntable) or path to a YAML file of options."""
-    solver: Literal["adam"] | None = None
-    """adam: Algorithm 1 of the paper."""
-    init: Literal["auto", "circular", "given"] | None = None
-    """Initial poses: the paper's circle, those in transforms.json, or (auto) the latter if there are any."""
+    solver: Solver | None = None
+    """lm (default): robust second-order solver; adam: Algorithm 1 of the paper."""
+    init: InitChoice | None = None
+    """Initial poses: a car template found in each view, the paper's circle, those in transforms.json, or (auto)
+    whichever leads to the best fit."""
     direction: Literal["ccw", "cw"] | None = None
-    """Sense in which the circle was walked, seen from above."""
+    """Sense in which the circle was walked, seen from above (--init auto finds out)."""
     laps: float | None = None
-    """How much of the circle was walked: 0.5 is half a lap."""
+    """How much of the circle was walked: 0.5 is half a lap (--init auto finds out)."""
+    refine_focal: Flag = False
+    """Treat the focal length as unknown, too."""
+    refine_k1: Flag = False
+    """Treat the first radial distortion coefficient as unknown, too."""
+    car_length_m: float | None = None
+    """True length of the car, bumper to bumper, for exact scale; otherwise its proportions tell it."""
+    min_status: MinStatus | None = None
+    """completed (default): views without usable keypoints are placed between their neighbours; solved: left out."""
     depth_init: Literal["random", "prior", "prior-fixed"] | None = None
-    """Initial depths: random as in the paper, or from depth maps (then optimised, or kept as they are)."""
+    """Initial depths of adam: random as in the paper, or from depth maps (then optimised, or kept as they are)."""
     device: Literal["auto", "cpu", "cuda"] | None = None
     """Where to solve; auto takes a GPU when there is one."""
     seed: int | None = None
@@ -68,12 +83,12 @@ class SolverOptions:
 
     def solver_config(self) -> KroncConfig:
         """The preset with these options on top."""
-        chosen = {f.name: getattr(self, f.name) for f in fields(SolverOptions) if f.name != "config"}
-        return load_config(self.config, **chosen)
+        given = {f.name: getattr(self, f.name) for f in fields(SolverOptions) if f.name != "config"}
+        return load_config(self.config, **{name: None if value is False else value for name, value in given.items()})
 
     def any_solver_option(self) -> bool:
         """Whether any option was given, so that an existing solution may not be what is wanted."""
-        return any(getattr(self, f.name) is not None for f in fields(SolverOptions))
+        return any(getattr(self, f.name) not in (None, False) for f in fields(SolverOptions))
 
 
 def _update(target: Any, content: Any, where: str) -> Any:
@@ -99,6 +114,10 @@ def _update(target: Any, content: Any, where: str) -> Any:
 
 
 def _check(value: Any, kind: Any, where: str) -> Any:
+    if get_origin(kind) is UnionType:  # only ever "this or None"
+        if value is None:
+            return None
+        kind = get_args(kind)[0]
     if get_origin(kind) is Literal:
         if value not in get_args(kind):
             raise KroncError(

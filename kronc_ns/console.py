@@ -2,6 +2,7 @@
 
 import errno
 import math
+import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -69,17 +70,28 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> Table:
     views = report["views"]
     solved = sum(view["status"] == ViewStatus.SOLVED.value for view in views)
     failed = [view for view in views if view["status"] == ViewStatus.FAILED.value]
-    rate = report["iterations"] / report["seconds"] if report["seconds"] else 0.0
+    completed = sum(view["status"] == ViewStatus.COMPLETED.value for view in views)
+    swapped = sum(view.get("swapped", False) for view in views)
     table = Table(title=f"KRONC: {report['status']}", title_justify="left", show_header=False)
     table.add_row("views solved", f"{solved} of {len(views)}")
+    if completed:
+        table.add_row(
+            "views completed", f"{completed}: placed between their neighbours (--min-status solved omits them)"
+        )
+    if swapped:
+        table.add_row("left and right", f"confused in {swapped} views, put right")
     for view in failed[:_LISTED]:
         table.add_row("  left out", f"{view['file_path']}: {view['reason']}")
     if len(failed) > _LISTED:
         table.add_row("  left out", f"... and {len(failed) - _LISTED} more (kronc.json lists all)")
     rmse, median = (math.nan if report[key] is None else report[key] for key in ("rmse_px", "median_px"))
     table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {median:.2f} px of all")
+    sigmas = [[view[key] for view in views if view[key] is not None] for key in ("sigma_rot_deg", "sigma_trans_m")]
+    if all(sigmas):
+        rotation, centre = (statistics.median(values) for values in sigmas)
+        table.add_row("standard deviation", f"{rotation:.2f} deg, {100 * centre:.1f} cm (median view)")
     table.add_row("solver", f"{report['solver']} from {report['init']} poses, {report['iterations']} steps")
-    table.add_row("time", f"{report['seconds']:.2f} s ({rate:.0f} steps/s)")
+    table.add_row("time", f"{report['seconds']:.3f} s")
     for note in notes:
         table.add_row("note", note)
     return table

@@ -135,25 +135,30 @@ def _steps(progress: Progress | None, config: KroncConfig) -> Callable[[int, flo
     return None if progress is None else lambda step, value: progress(step, config.lm.iterations, value)
 
 
-def _lm(
-    scenes: Sequence[Scene], config: KroncConfig, progress: Callable[[int, float], None] | None
-) -> list[Attempt]:
+def _lm(scenes: Sequence[Scene], config: KroncConfig, progress: Callable[[int, float], None] | None) -> list[Attempt]:
     """The best attempt at every scene: starts are tried in turn until one is good, odd views repaired."""
-    best: list[Attempt | None] = [None] * len(scenes)
+    tried: list[list[Attempt]] = [[] for _ in scenes]
     tiers = [_tiers(scene, config) for scene in scenes]
     for rank in range(max(map(len, tiers), default=0)):
-        open_scenes = [
-            i for i, tier in enumerate(tiers) if rank < len(tier) and not (best[i] and _good(best[i], scenes[i]))
+        starts = [
+            (i, start)
+            for i, tier in enumerate(tiers)
+            if rank < len(tier) and not any(_good(attempt, scenes[i]) for attempt in tried[i])
+            for start in tier[rank]()
         ]
-        starts = [(i, start) for i in open_scenes for start in tiers[i][rank]()]
-        attempts = adjust_starts([start for _, start in starts], config, progress)
-        if rank == 0 or attempts:
-            attempts = repair(attempts, config)
+        attempts = repair(adjust_starts([start for _, start in starts], config, progress), config)
         for (i, _), attempt in zip(starts, attempts, strict=True):
-            rival = best[i]
-            if rival is None or misfit(attempt) < misfit(rival):
-                best[i] = attempt
-    return [attempt for attempt in best if attempt is not None]
+            tried[i].append(attempt)
+    return [_best(attempts) for attempts in tried]
+
+
+def _best(attempts: Sequence[Attempt]) -> Attempt:
+    """The attempt that leaves least unexplained, and why it was chosen."""
+    ranked = sorted(attempts, key=misfit)
+    names = [f"{attempt.start.name} ({100 * (1 - misfit(attempt)):.0f} %)" for attempt in ranked[:3]]
+    if len(ranked) == 1:
+        return replace(ranked[0], choice=f"start: {ranked[0].start.name}")
+    return replace(ranked[0], choice=f"start: {names[0]} explains more of the detections than {', '.join(names[1:])}")
 
 
 def _tiers(scene: Scene, config: KroncConfig) -> list[Callable[[], list[Start]]]:
@@ -194,9 +199,7 @@ def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attem
     """Algorithm 1 on the usable views, in float32."""
     given = scene.given_c2w is not None and config.init in ("auto", "given")
     name: Literal["given", "circular"] = "given" if given else "circular"
-    initial = (
-        _given(scene) if given else circular_poses(len(scene), config.radius_m, config.direction, config.laps)
-    )
+    initial = _given(scene) if given else circular_poses(len(scene), config.radius_m, config.direction, config.laps)
     usable = usable_views(scene)
     c2w = torch.full_like(initial, math.nan)
     if not usable.any():
@@ -276,6 +279,8 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig) -> Solution:
     views, status, reason, rmse_px, median_px = verify(start.scene, solution, evidence)
     if status is not Status.CONVERGED and config.init == "circular":
         reason += "; was the lap walked the other way (direction cw), or not whole (laps)? init auto finds out"
+    if attempt.choice:
+        reason += f"; {attempt.choice}"
     solved = torch.tensor([view.status is ViewStatus.SOLVED for view in views])
     solution = replace(
         solution,

@@ -18,6 +18,7 @@ LAYERS = [
     {"pipeline"},
     {"config", "evaluate", "capture", "export", "report", "plots", "viewer"},
     {"synthetic", "console", "benchmark"},
+    {"batch"},
     {"cli", "plugin"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -5,18 +5,20 @@ import pytest
 import torch
 
 from kronc_ns.errors import KroncError
+from kronc_ns.frame import car_axes
 from kronc_ns.geometry.alignment import pose_errors, umeyama
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.init import noisy_poses
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
-from kronc_ns.pipeline import KroncConfig, car_axes, fingerprint, residuals_px, solve_scene
+from kronc_ns.pipeline import KroncConfig, fingerprint, solve_scene
 from kronc_ns.scene import Scene, load_scene
 from kronc_ns.solve.adam import AdamConfig
 from kronc_ns.solve.solution import Status, ViewStatus
 from kronc_ns.synthetic.scenes import make_capture
+from kronc_ns.verify import residuals_px
 from tests.conftest import scene_of
 
-QUICK = KroncConfig(adam=AdamConfig(steps=800, learning_rate=0.03))
+QUICK = KroncConfig(solver="adam", adam=AdamConfig(steps=800, learning_rate=0.03))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +90,7 @@ def test_a_view_of_another_car_is_found_out(noisy):
 
 
 def test_same_seed_same_bits_and_the_seed_matters(noisy):
-    short = KroncConfig(adam=AdamConfig(steps=30))
+    short = KroncConfig(solver="adam", adam=AdamConfig(steps=30))
     # so early no pose is trusted (NaN), but points there are
     first, second, other = (solve_scene(noisy, replace(short, seed=seed)).points.nan_to_num() for seed in (0, 0, 1))
     assert first.any()
@@ -102,17 +104,17 @@ def test_given_depths_speed_up_and_can_be_fixed(noisy, walk_capture):
     world = torch.from_numpy(walk_capture.car.keypoints).expand(16, -1, -1)
     scene = replace(noisy, given_depths=transform(invert(walk_capture.c2w), world)[..., 2])
     few = AdamConfig(steps=300)
-    prior = solve_scene(scene, KroncConfig(depth_init="prior", adam=few))
-    random = solve_scene(scene, KroncConfig(depth_init="random", adam=few))
+    prior = solve_scene(scene, KroncConfig(solver="adam", depth_init="prior", adam=few))
+    random = solve_scene(scene, KroncConfig(solver="adam", depth_init="random", adam=few))
     error = [pose_errors(s.c2w, walk_capture.c2w)[1].median() for s in (prior, random)]
     assert error[0] < error[1]
-    fixed = solve_scene(scene, KroncConfig(depth_init="prior-fixed", adam=few))
+    fixed = solve_scene(scene, KroncConfig(solver="adam", depth_init="prior-fixed", adam=few))
     ratio = (fixed.depths / scene.given_depths)[fixed.depths.isfinite()]
     torch.testing.assert_close(ratio, ratio[0].expand_as(ratio), rtol=1e-5, atol=0)  # one scale for all
 
 
 def test_residuals_are_infinite_behind_a_camera(noisy, walk_capture):
-    solution = solve_scene(noisy, KroncConfig(adam=AdamConfig(steps=10)))
+    solution = solve_scene(noisy, KroncConfig(solver="adam", adam=AdamConfig(steps=10)))
     behind = walk_capture.c2w.clone()
     behind[0, :, [0, 2]] *= -1  # turned away from the car
     truth = torch.from_numpy(walk_capture.car.keypoints)
@@ -144,7 +146,7 @@ def test_views_without_overlap_are_refused(noisy):
     ("config", "message"),
     [
         (KroncConfig(init="given"), "transform_matrix"),
-        (KroncConfig(depth_init="prior"), "depth_file_path"),
+        (KroncConfig(solver="adam", depth_init="prior"), "depth_file_path"),
         (KroncConfig(device="cuda"), "CUDA"),
     ],
 )
@@ -165,7 +167,7 @@ def test_impossible_options_are_refused():
         with pytest.raises(KroncError):
             KroncConfig(**change)
     with pytest.raises(KroncError, match="not both be 0"):
-        KroncConfig(adam=AdamConfig(weight_2d=0.0, weight_3d=0.0))
+        KroncConfig(solver="adam", adam=AdamConfig(weight_2d=0.0, weight_3d=0.0))
 
 
 def test_car_axes_follow_the_car():

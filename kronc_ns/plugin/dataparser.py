@@ -5,7 +5,7 @@ nerfstudio loads dataparsers while those are still being imported.
 """
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -23,10 +23,11 @@ from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.poses import flip_camera_axes
+from kronc_ns.keypoints.io import read_json
 from kronc_ns.plugin.cache import read_report, solve_cached
 from kronc_ns.plugin.images import cut_out, downscaled
 from kronc_ns.plugin.seeds import seed_points
-from kronc_ns.scene import Scene, load_scene, read_poses
+from kronc_ns.scene import Scene, camera_and_frames, load_scene, read_poses
 from kronc_ns.solve.solution import Status
 
 _BOX_MARGIN = 0.1  # of the car's length: keypoints stop short of tyres, mirrors and the roof
@@ -93,6 +94,8 @@ class KroncDataParser(DataParser):
         if report["status"] == Status.FAILED.value:
             sys.exit(doubt)
         poses = read_poses(folder / "transforms.json")
+        camera, _ = camera_and_frames(read_json(folder / "transforms.json"), folder / "transforms.json")
+        scene = replace(scene, camera=camera)  # its intrinsics may have been refined
         return scene, {PurePosixPath(name).name: pose for name, pose in poses.items()}, report
 
     def _outputs(self, split: str, scene: Scene, poses: dict[str, Tensor], report: dict[str, Any]) -> DataparserOutputs:

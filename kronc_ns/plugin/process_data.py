@@ -1,7 +1,7 @@
 """`ns-process-data kronc` and its twin `kronc-process-data`: video or photos to a dataset with solved poses."""
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Union
@@ -95,6 +95,8 @@ class KroncToNerfstudio:
         note = _write_keypoints(found, frames, intrinsics.camera, masks, out)
 
         scene = load_scene(out)
+        if intrinsics.assumed and config.solver == "lm":
+            config = replace(config, refine_focal=True)
         with progress_bar("solving") as progress:
             solution = solve_scene(scene, config, progress)
         report = write_solution(out, scene, solution, out, fingerprint(scene, config))
@@ -103,7 +105,8 @@ class KroncToNerfstudio:
         levels = "".join(f", 1/{factor}" for factor in frames.factors)
         origin = "as an earlier run left them" if frames.reused else f"from {source.kind} {self.data}"
         table.add_row("frames", f"{len(frames.names)} of {frames.size[0]}x{frames.size[1]}{levels}, {origin}")
-        table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}")
+        refined = f", refined to {solution.camera.fx:.1f} px" if config.refine_focal else ""
+        table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}{refined}")
         Console().print(table)
         status = exit_status(report)
         if status == 0:

@@ -10,12 +10,11 @@ reduced system are ordered (x of all points, y of all, z of all, intrinsics).
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from typing_extensions import Self
 
 from kronc_ns.geometry.rotations import so3_exp
 
@@ -24,10 +23,13 @@ _NEAR = 1e-6  # smallest z that is "in front", in world units
 _TINY = 1e-12
 
 
+Record = TypeVar("Record", bound="Batched")
+
+
 class Batched:
     """A dataclass of tensors (or of such dataclasses) with the scenes in front."""
 
-    def each(self, function: Callable[..., Tensor], *others: Self) -> Self:
+    def each(self: Record, function: Callable[..., Tensor], *others: Record) -> Record:
         """``function`` of every tensor and its counterparts in ``others``."""
         changes = {}
         for f in fields(self):  # pyright: ignore[reportArgumentType]
@@ -38,7 +40,7 @@ class Batched:
                 changes[f.name] = value.each(function, *(getattr(other, f.name) for other in others))
         return replace(self, **changes)  # pyright: ignore[reportArgumentType]
 
-    def __getitem__(self, scenes: Int[Tensor, "c"]) -> Self:
+    def __getitem__(self: Record, scenes: Int[Tensor, "c"]) -> Record:
         return self.each(lambda x: x[scenes])
 
 
@@ -56,7 +58,7 @@ class ShapePrior:
     """Degrees of freedom of the tail (Student t): the fewer, the sooner an unusual shape is believed."""
 
     @staticmethod
-    def of(mean: Float[Tensor, "j 3"], precision: Float[Tensor, "3j 3j"]) -> "ShapePrior":
+    def of(mean: Float[Tensor, "j 3"], precision: Float[Tensor, "p p"]) -> "ShapePrior":
         """Prior from a mean shape and an inverse covariance in the order index = 3 * point + axis."""
         order = torch.arange(mean.numel(), device=mean.device).view(-1, 3).T.flatten()
         return ShapePrior(mean.T.flatten(), precision[order][:, order].contiguous())
@@ -157,8 +159,8 @@ class Linearisation:
     """Normal equations of a batch, the cameras' blocks apart from the points' (and intrinsics')."""
 
     camera: Float[Tensor, "b n 6 6"]
-    coupling: Float[Tensor, "b n 6 p+1"]
-    """Cameras against the p = 3J + K other unknowns; the last column is the cameras' gradient."""
+    coupling: Float[Tensor, "b n 6 q"]
+    """Cameras against the p = 3J + K other unknowns; the last of the q = p + 1 columns is the cameras' gradient."""
     point: Float[Tensor, "b p p"]
     point_gradient: Float[Tensor, "b p"]
 
@@ -240,9 +242,7 @@ def linearise(
     return Linearisation(camera, coupling, point, gradient)
 
 
-def _add_orbit(
-    orbit: OrbitPrior, state: State, variance: Tensor, camera: Tensor, camera_gradient: Tensor
-) -> None:
+def _add_orbit(orbit: OrbitPrior, state: State, variance: Tensor, camera: Tensor, camera_gradient: Tensor) -> None:
     strength = variance[:, None] / orbit.sigma.square()
     camera[:, :, 3:, 3:].diagonal(dim1=2, dim2=3).add_(strength[..., None])
     camera_gradient[:, :, 3:].addcmul_(strength[..., None], orbit_error(orbit, state))
@@ -266,8 +266,8 @@ class Reduced:
 
     whitener: Float[Tensor, "b n 6 6"]
     """Inverse Cholesky factors of the cameras' blocks."""
-    whitened: Float[Tensor, "b 6n p+1"]
-    """The cameras' rows of the system times ``whitener``; the last column is their gradient."""
+    whitened: Float[Tensor, "b c q"]
+    """The c = 6N rows of the cameras times ``whitener``; the last column is their gradient."""
     matrix: Float[Tensor, "b p p"]
     rhs: Float[Tensor, "b p"]
 

@@ -39,7 +39,7 @@ _LOOSE = 0.7
 _ROUNDS = 8
 _START_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e9
 
-DEBUG=False
+DEBUG = False
 _ROBUST, _TRIMMED = 0, 1
 
 
@@ -154,24 +154,31 @@ def _adjust(
     )
 
 
-def _iterate(
-    problem: Problem, search: _Search, counts: Tensor, config: LmConfig
-) -> tuple[_Search, Bool[Tensor, "b"]]:
+def _iterate(problem: Problem, search: _Search, counts: Tensor, config: LmConfig) -> tuple[_Search, Bool[Tensor, "b"]]:
     """One damped step of every scene in the batch, and which scenes are finished."""
     weight = _irls_weight(search, config)
     variance = search.sigma.square()
-    system = linearise(
-        problem, search.state, search.residual, weight, variance, _shape_weight(problem, search.state)
-    )
+    system = linearise(problem, search.state, search.residual, weight, variance, _shape_weight(problem, search.state))
     trial = move(search.state, solve_step(eliminate_cameras(system, search.damping), problem.uv.shape[3]))
     attempt = replace(search, state=trial, residual=residuals(problem, trial))
     cost = _cost(problem, attempt, config)
     better = cost < search.cost  # false for NaN
-    tolerance = torch.where(search.phase == _ROBUST, _COARSE if config.loss == "cauchy" else config.tolerance, config.tolerance)
+    tolerance = torch.where(
+        search.phase == _ROBUST, _COARSE if config.loss == "cauchy" else config.tolerance, config.tolerance
+    )
     still = (search.cost - cost).abs() <= tolerance * search.cost
     damping = torch.where(better, search.damping / 10, search.damping * 10).clamp(min=_LEAST_DAMPING)
     settled = still | (damping > _MOST_DAMPING)
-    if DEBUG: print(float(search.sigma[0]), float(search.phase[0]), float(search.cost[0]), float(cost[0]), float(1-cost[0]/search.cost[0]), float(search.damping[0]), float(trial.points.sub(search.state.points).norm()))
+    if DEBUG:
+        print(
+            float(search.sigma[0]),
+            float(search.phase[0]),
+            float(search.cost[0]),
+            float(cost[0]),
+            float(1 - cost[0] / search.cost[0]),
+            float(search.damping[0]),
+            float(trial.points.sub(search.state.points).norm()),
+        )
     search = _choose(better, replace(attempt, cost=cost), search)
     search = replace(search, damping=damping.clamp(max=_MOST_DAMPING))
     return _anneal(problem, search, settled, counts, config)
