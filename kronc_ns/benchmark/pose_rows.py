@@ -39,7 +39,7 @@ def pose_tasks(options: Options) -> list[Task]:
     tasks = [
         Task(
             f"efficiency from ({start[0]:g} deg, {start[1]:g} m)",
-            "ratio to maximum likelihood: median <= 1.01, worst <= 1.05",
+            "ratio to maximum likelihood: median <= 1.01, worst <= 1.05, no seed lost",
             "hemisphere 400x400, 100 views, 1 px",
             20,
             lambda seed, start=start: measures.from_start(seed, start, adam=options.with_adam(seed)),
@@ -64,7 +64,7 @@ def pose_tasks(options: Options) -> list[Task]:
     tasks += [
         Task(
             "30 % outliers",
-            "<= 1.5 x the optimum of the same capture without outliers, every seed",
+            "every seed <= 1.5 x the optimum of the same capture without outliers, every view with a pose",
             "hemisphere 400x400, 100 views, 1 px, from (4 deg, 0.5 m)",
             20,
             measures.many_outliers,

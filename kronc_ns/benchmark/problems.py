@@ -116,7 +116,8 @@ def noisy_start(capture: Capture, pose_noise: tuple[float, float], seed: int) ->
 def best_poses(capture: Capture) -> Float[Tensor, "n 3 4"]:
     """The yardstick: maximum likelihood from the truth, on true inliers alone where there are outliers.
 
-    An oracle: no solver knows which detections are wild, so none can be expected below it on average.
+    An oracle: no solver knows which detections are wild, so none can be expected below it on average, unless it
+    knows something of cars (as a shape prior does: with few views that is worth more than some of the data).
     """
     return bundle_adjustment(capture_scene(capture), capture.c2w, capture.points, ~capture.wild).c2w
 

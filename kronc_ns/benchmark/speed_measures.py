@@ -59,7 +59,7 @@ def without_pose(seed: int, shapes: Shapes) -> Figures:
 
 def judge_time(runs: Runs) -> Verdict:
     """Nothing is asked."""
-    return {**_times(runs), "lost": runs.lost}, None
+    return {**_times(runs), "seeds_lost": runs.lost}, None
 
 
 def _times(runs: Runs) -> dict[str, float]:
@@ -70,7 +70,7 @@ def _times(runs: Runs) -> dict[str, float]:
 def judge_warm(runs: Runs) -> Verdict:
     """30 ms, median over the seeds."""
     reached = _times(runs)
-    return {**reached, "lost": runs.lost}, runs.lost == 0 and reached["milliseconds_median"] <= 30
+    return {**reached, "seeds_lost": runs.lost}, runs.lost == 0 and reached["milliseconds_median"] <= 30
 
 
 def against_adam(seed: int) -> Figures:
