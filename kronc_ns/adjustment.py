@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from kronc_ns import objective
@@ -22,13 +22,14 @@ from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.options import KroncConfig
 from kronc_ns.scene import Scene
-from kronc_ns.solve.bundle import Problem, ShapePrior, State
+from kronc_ns.solve.bundle import Problem, ShapePrior, State, linearise, residuals
 from kronc_ns.solve.lm import LmResult, adjust
 from kronc_ns.solve.resection import AWAY, locate
 from kronc_ns.solve.uncertainty import camera_covariance
 
 MIN_POINTS = 4
 """A view with fewer keypoints cannot be placed by them alone (three points have up to four poses)."""
+_NO_CHANCE = 8  # a pose can be bent to meet three detections; eight do not agree by accident
 _ALL_LAPS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 _TEMPLATE_TOLERANCE = 0.03  # of the car's extent in the image: about 13 cm on the car
 _LOST = 0.8  # mean robust cost of a view's detections from which on its pose says nothing
@@ -76,10 +77,13 @@ class Attempt:
 
     @property
     def agreeing(self) -> Bool[Tensor, "n"]:
-        """Views of which most detections fit."""
-        seen = (self.start.scene.visibility > 0).sum(1)
-        inliers = self.inlier.sum(1)
-        return (inliers >= MIN_POINTS) & (2 * inliers >= seen)
+        """Views that `agrees` with the solved points."""
+        return agrees(self.inlier.sum(1), (self.start.scene.visibility > 0).sum(1))
+
+
+def agrees(inliers: Int[Tensor, "n"], seen: Int[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Whether views fit the solved points: half of their detections do, or so many that it cannot be chance."""
+    return (inliers >= MIN_POINTS) & (2 * inliers >= seen) | (inliers >= _NO_CHANCE) & (4 * inliers >= seen)
 
 
 @lru_cache(maxsize=8)
@@ -176,7 +180,7 @@ def _run(
         result = adjust(problem, state, config.lm, progress)
         starts = [_moved(start, result, i, refine) for i, start in enumerate(starts)]
     inlier = result.inlier
-    covariance = camera_covariance(problem, result.state, inlier, result.sigma_px, result.shape_weight)
+    covariance = camera_covariance(result.state, result.system, inlier.any(1), result.sigma_px)
     inlier, covariance = inlier.cpu(), covariance.cpu()
     sigma, weight = result.sigma_px.tolist(), result.shape_weight.tolist()
     iterations, converged = result.iterations.tolist(), result.converged.tolist()
@@ -251,7 +255,9 @@ def measured(
         known = replace(start, points=start.points.nan_to_num(0.0))
         problem, state = _problem([known], len(scene), (), None)
         one = torch.ones(1, dtype=torch.float64)
-        covariance = camera_covariance(problem, state, inlier[None], one * sigma_px, one)[0]
+        weight = inlier[None].to(torch.float64)
+        system = linearise(problem, state, residuals(problem, state), weight, one * sigma_px**2, one)
+        covariance = camera_covariance(state, system, inlier[None].any(1), one * sigma_px)[0]
     return Attempt(start, initial_c2w, inlier, sigma_px, 1.0, covariance, iterations, True, history)
 
 

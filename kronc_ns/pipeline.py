@@ -37,7 +37,7 @@ from kronc_ns.scene import Scene
 from kronc_ns.solve.adam import AdamResult, minimise
 from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
 from kronc_ns.solve.threads import one_thread
-from kronc_ns.verify import Evidence, inliers, verify
+from kronc_ns.verify import Evidence, verify
 
 _FORMAT = 2  # raised whenever the same input and options give another solution
 _GOOD_SHARE = 0.9  # views that agree, from which on no other start is tried
@@ -154,11 +154,12 @@ def _lm(scenes: Sequence[Scene], config: KroncConfig, progress: Callable[[int, f
 
 def _best(attempts: Sequence[Attempt]) -> Attempt:
     """The attempt that leaves least unexplained, and why it was chosen."""
-    ranked = sorted(attempts, key=misfit)
-    names = [f"{attempt.start.name} ({100 * (1 - misfit(attempt)):.0f} %)" for attempt in ranked[:3]]
-    if len(ranked) == 1:
-        return replace(ranked[0], choice=f"start: {ranked[0].start.name}")
-    return replace(ranked[0], choice=f"start: {names[0]} explains more of the detections than {', '.join(names[1:])}")
+    if len(attempts) == 1:
+        return replace(attempts[0], choice=f"start: {attempts[0].start.name}")
+    ranked = sorted(((misfit(attempt), i) for i, attempt in enumerate(attempts)))
+    names = [f"{attempts[i].start.name} ({100 * (1 - lost):.0f} %)" for lost, i in ranked[:3]]
+    choice = f"start: {names[0]} explains more of the detections than {', '.join(names[1:])}"
+    return replace(attempts[ranked[0][1]], choice=choice)
 
 
 def _tiers(scene: Scene, config: KroncConfig) -> list[Callable[[], list[Start]]]:

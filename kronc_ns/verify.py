@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from kronc_ns import objective
-from kronc_ns.adjustment import MIN_POINTS
+from kronc_ns.adjustment import MIN_POINTS, agrees
 from kronc_ns.scene import Scene
 from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
 
@@ -61,24 +61,21 @@ def verify(scene: Scene, solution: Solution, evidence: Evidence) -> tuple[list[V
     seen, found = (~error.isnan()).sum(1), scene.visibility.sum(1)
     good = inlier.sum(1)
     rmse = (torch.where(inlier, error.square(), 0.0).sum(1) / good).sqrt()
-    reports = []
-    for i, name in enumerate(scene.names):
-        reason = _doubt(int(found[i]), int(seen[i]), int(good[i]))
-        if reason:
-            reports.append(ViewReport(name, ViewStatus.FAILED, int(found[i]), int(good[i]), None, reason=reason))
-            continue
-        reports.append(
-            ViewReport(
-                name,
-                ViewStatus.SOLVED,
-                int(found[i]),
-                int(good[i]),
-                float(rmse[i]),
-                _known(evidence.sigma_rot_deg[i]),
-                _known(evidence.sigma_trans_m[i]),
-                swapped=bool(evidence.swapped[i]),
-            )
+    reports = [
+        _report(*row)
+        for row in zip(
+            scene.names,
+            found.int().tolist(),
+            seen.tolist(),
+            good.tolist(),
+            agrees(good, seen).tolist(),
+            rmse.tolist(),
+            evidence.sigma_rot_deg.tolist(),
+            evidence.sigma_trans_m.tolist(),
+            evidence.swapped.tolist(),
+            strict=True,
         )
+    ]
     solved = torch.tensor([report.status is ViewStatus.SOLVED for report in reports])
     kept = inlier & solved[:, None]
     median = float(error[solved].nanmedian()) if solved.any() else math.nan
@@ -89,17 +86,33 @@ def verify(scene: Scene, solution: Solution, evidence: Evidence) -> tuple[list[V
     return reports, status, reason, total, median
 
 
-def _known(value: Tensor) -> float | None:
-    return float(value) if value.isfinite() else None
-
-
-def _doubt(found: int, seen: int, good: int) -> str:
-    """Why a view is not solved, or nothing."""
+def _report(
+    name: str,
+    found: int,
+    seen: int,
+    good: int,
+    agree: bool,
+    rmse: float,
+    sigma_rot: float,
+    sigma_trans: float,
+    swapped: bool,
+) -> ViewReport:
+    reason = ""
     if found < MIN_POINTS:
-        return f"{found} keypoints, at least {MIN_POINTS} are needed"
-    if good < MIN_POINTS or 2 * good < seen:
-        return f"only {good} of {seen} keypoints agree with the other views"
-    return ""
+        reason = f"{found} keypoints, at least {MIN_POINTS} are needed"
+    elif seen == 0:
+        reason = f"no pose was found that agrees with its {found} keypoints"
+    elif not agree:
+        reason = f"only {good} of {seen} keypoints agree with the other views"
+    if reason:
+        return ViewReport(name, ViewStatus.FAILED, found, good, None, reason=reason)
+    return ViewReport(
+        name, ViewStatus.SOLVED, found, good, rmse, _known(sigma_rot), _known(sigma_trans), swapped=swapped
+    )
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _judge(scene: Scene, solved: Bool[Tensor, "n"], median_px: float, evidence: Evidence) -> tuple[Status, str]:

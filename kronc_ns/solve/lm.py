@@ -18,6 +18,7 @@ from typing_extensions import assert_never
 
 from kronc_ns.solve.bundle import (
     Batched,
+    Linearisation,
     Problem,
     Residuals,
     State,
@@ -39,7 +40,6 @@ _LOOSE = 0.7
 _ROUNDS = 8
 _START_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e9
 
-DEBUG = False
 _ROBUST, _TRIMMED = 0, 1
 
 
@@ -67,6 +67,8 @@ class LmResult:
     inlier: Bool[Tensor, "b n j"]
     shape_weight: Float[Tensor, "b"]
     """What the shape prior counted at last: 1 for a usual shape, less for an unusual one."""
+    system: Linearisation
+    """Undamped normal equations of the last step, for `camera_covariance`."""
     iterations: Int[Tensor, "b"]
     converged: Bool[Tensor, "b"]
     history: dict[str, list[float]] = field(default_factory=dict)
@@ -85,6 +87,14 @@ class _Search(Batched):
     cost: Float[Tensor, "b"]
     damping: Float[Tensor, "b"]
     rounds: Int[Tensor, "b"]
+
+
+@dataclass(frozen=True)
+class _Finished(Batched):
+    """What is kept of a scene that leaves the batch."""
+
+    search: _Search
+    system: Linearisation
 
 
 def adjust(
@@ -117,68 +127,57 @@ def _adjust(
         rounds=torch.zeros(scenes, dtype=torch.long, device=problem.uv.device),
     )
     search = replace(search, cost=_cost(problem, search, config))
-    final = search
+    finished = None
     steps = torch.zeros(scenes, dtype=torch.long, device=problem.uv.device)
     converged = torch.zeros(scenes, dtype=torch.bool, device=problem.uv.device)
     history: dict[str, list[float]] = {"step": [], "loss": []}
-    detections = int((problem.weight[0] > 0).sum())
+    detections = max(1, int((problem.weight[0] > 0).sum()))
     for step in range(1, config.iterations + 1):
-        search, done = _iterate(problem, search, counts, config)
+        weight, shape_weight = _irls_weight(search, config), _shape_weight(problem, search.state)
+        system = linearise(problem, search.state, search.residual, weight, search.sigma.square(), shape_weight)
+        search, done = _iterate(problem, search, system, counts, config)
         steps[search.scene] = step
         if search.scene[0] == 0:
-            loss = math.sqrt(float(search.cost[0]) / max(detections, 1))
+            loss = math.sqrt(float(search.cost[0]) / detections)
             history["step"].append(float(step))
             history["loss"].append(loss)
             if progress is not None:
                 progress(step, loss)
-        if done.any():
-            converged[search.scene[done]] = True
-            final = _store(final, search, done)
-            keep = torch.nonzero(~done)[:, 0]
+        converged[search.scene[done]] = True
+        leaving = done if step < config.iterations else torch.ones_like(done)
+        if leaving.any() or finished is None:
+            finished = _store(finished, _Finished(search, system), leaving)
+            keep = torch.nonzero(~leaving)[:, 0]
             if not len(keep):
                 break
             problem, search, counts = problem[keep], search[keep], counts[keep]
-    else:
-        final = _store(final, search, torch.ones_like(search.damping, dtype=torch.bool))
-    norm, sigma = final.residual.norm, final.sigma
-    inlier = (whole.weight > 0) & (norm <= _TRIM_SIGMAS * sigma[:, None, None])
+    assert finished is not None
+    final, sigma = finished.search, finished.search.sigma
     return LmResult(
         state=final.state,
         cost=final.cost / sigma.square(),
         sigma_px=sigma,
-        inlier=inlier,
+        inlier=(whole.weight > 0) & (final.residual.norm <= _TRIM_SIGMAS * sigma[:, None, None]),
         shape_weight=_shape_weight(whole, final.state),
+        system=finished.system,
         iterations=steps,
         converged=converged,
         history=history,
     )
 
 
-def _iterate(problem: Problem, search: _Search, counts: Tensor, config: LmConfig) -> tuple[_Search, Bool[Tensor, "b"]]:
+def _iterate(
+    problem: Problem, search: _Search, system: Linearisation, counts: Tensor, config: LmConfig
+) -> tuple[_Search, Bool[Tensor, "b"]]:
     """One damped step of every scene in the batch, and which scenes are finished."""
-    weight = _irls_weight(search, config)
-    variance = search.sigma.square()
-    system = linearise(problem, search.state, search.residual, weight, variance, _shape_weight(problem, search.state))
     trial = move(search.state, solve_step(eliminate_cameras(system, search.damping), problem.uv.shape[3]))
     attempt = replace(search, state=trial, residual=residuals(problem, trial))
     cost = _cost(problem, attempt, config)
     better = cost < search.cost  # false for NaN
-    tolerance = torch.where(
-        search.phase == _ROBUST, _COARSE if config.loss == "cauchy" else config.tolerance, config.tolerance
-    )
-    still = (search.cost - cost).abs() <= tolerance * search.cost
+    coarse = (search.phase == _ROBUST) & (config.loss == "cauchy")
+    still = (search.cost - cost).abs() <= torch.where(coarse, _COARSE, config.tolerance) * search.cost
     damping = torch.where(better, search.damping / 10, search.damping * 10).clamp(min=_LEAST_DAMPING)
     settled = still | (damping > _MOST_DAMPING)
-    if DEBUG:
-        print(
-            float(search.sigma[0]),
-            float(search.phase[0]),
-            float(search.cost[0]),
-            float(cost[0]),
-            float(1 - cost[0] / search.cost[0]),
-            float(search.damping[0]),
-            float(trial.points.sub(search.state.points).norm()),
-        )
     search = _choose(better, replace(attempt, cost=cost), search)
     search = replace(search, damping=damping.clamp(max=_MOST_DAMPING))
     return _anneal(problem, search, settled, counts, config)
@@ -224,11 +223,11 @@ def _choose(chosen: Bool[Tensor, "b"], yes: _Search, no: _Search) -> _Search:
     return yes.each(lambda a, b: torch.where(chosen.view(-1, *[1] * (a.ndim - 1)), a, b), no)
 
 
-def _store(final: _Search, search: _Search, chosen: Bool[Tensor, "b"]) -> _Search:
-    """``final`` (all scenes) with the chosen scenes of ``search`` (those still in the batch)."""
-    if len(search.scene) == len(final.scene) and bool(chosen.all()):
-        return search
-    return final.each(lambda a, b: a.index_copy(0, search.scene[chosen], b[chosen]), search)
+def _store(finished: _Finished | None, present: _Finished, chosen: Bool[Tensor, "b"]) -> _Finished:
+    """What is kept of all scenes, with the chosen ones of those still in the batch."""
+    if finished is None or (len(chosen) == len(finished.search.scene) and bool(chosen.all())):
+        return present
+    return finished.each(lambda a, b: a.index_copy(0, present.search.scene[chosen], b[chosen]), present)
 
 
 def _robust_sigma(problem: Problem, residual: Residuals) -> Float[Tensor, "b"]:
