@@ -123,6 +123,7 @@ def test_the_report_names_every_view_and_holds_no_nan(solved, solution):
         "sigma_rot_deg": None,
         "sigma_trans_m": None,
         "reason": "",
+        "swapped": False,
     }
     assert report["points"][3] == [None] * 3
     np.testing.assert_allclose(report["points"][4], solution.points[4])

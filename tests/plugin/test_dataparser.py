@@ -47,7 +47,7 @@ def rendered(place) -> Path:
 
 @pytest.fixture(scope="module")
 def config(place) -> str:
-    (place / "quick.yaml").write_text("radius_m: 5.0\nadam:\n  steps: 1500\n  learning_rate: 0.03\n")
+    (place / "quick.yaml").write_text("init: template\n")
     return str(place / "quick.yaml")
 
 
@@ -184,7 +184,7 @@ def test_a_view_with_three_keypoints_is_left_out_and_listed(changed, parser, edi
             rows[j] = [0, 0, 0]
 
     edit(changed / "keypoints.json", thin)
-    one = parser(changed, background="keep")
+    one = parser(changed, background="keep", min_status="solved")
     train, val = (view_numbers(one.get_dataparser_outputs(split=s)) for s in ("train", "val"))
     assert sorted(train + val) == [i for i in range(VIEWS) if i != POOR]
     assert val == [0, 8], "the split does not shift"
@@ -192,6 +192,9 @@ def test_a_view_with_three_keypoints_is_left_out_and_listed(changed, parser, edi
     assert "15 of 16" in printed
     assert f"images/frame_{POOR + 1:05d}.png" in printed
     assert "3 keypoints" in printed
+    completed = parser(changed, background="keep").get_dataparser_outputs(split="all")
+    assert view_numbers(completed) == list(range(VIEWS))
+    assert "views completed │ 1" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_processed_folder_may_have_left_views_out(changed, solution, no_solver):
@@ -368,18 +371,18 @@ def refused(parser, capsys):
 
 
 def test_poses_nobody_can_trust_are_not_trained_on(refused, place):
-    (place / "hasty.yaml").write_text("adam:\n  steps: 3\n")
+    (place / "hasty.yaml").write_text("solver: adam\nadam:\n  steps: 3\n")
     for _ in range(2):  # solved, then from the cache
         refused("failed", "px", status=3, config=str(place / "hasty.yaml"))
 
 
 def test_a_loss_that_is_not_finite_ends_as_clearly(refused, place):
-    (place / "wild.yaml").write_text("adam:\n  steps: 20\n  learning_rate: 1.0e+30\n")
+    (place / "wild.yaml").write_text("solver: adam\nadam:\n  steps: 20\n  learning_rate: 1.0e+30\n")
     refused("failed", status=3, config=str(place / "wild.yaml"))
 
 
 def test_a_solution_that_is_not_finite_is_an_error(refused, place):
-    (place / "wilder.yaml").write_text("adam:\n  steps: 20\n  learning_rate: 1.0e+38\n")
+    (place / "wilder.yaml").write_text("solver: adam\nadam:\n  steps: 20\n  learning_rate: 1.0e+38\n")
     refused("not finite", "learning_rate", config=str(place / "wilder.yaml"))
 
 
