@@ -13,14 +13,19 @@ with jaxtyping.install_import_hook(
         "kronc_ns.init",
         "kronc_ns.solve",
         "kronc_ns.keypoints",
+        "kronc_ns.frame",
+        "kronc_ns.orbit",
+        "kronc_ns.adjustment",
         "kronc_ns.evaluate",
     ],
     "beartype.beartype",
 ):
+    import kronc_ns.adjustment
     import kronc_ns.evaluate
     import kronc_ns.init
     import kronc_ns.keypoints.select
     import kronc_ns.objective
+    import kronc_ns.orbit
     import kronc_ns.solve.adam  # noqa: F401
 
 import torch
