@@ -22,7 +22,7 @@ from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.options import KroncConfig
 from kronc_ns.scene import Scene
-from kronc_ns.solve.bundle import Problem, ShapePrior, State, linearise, residuals
+from kronc_ns.solve.bundle import Problem, ShapePrior, State
 from kronc_ns.solve.lm import LmResult, adjust
 from kronc_ns.solve.resection import AWAY, locate
 from kronc_ns.solve.uncertainty import camera_covariance
@@ -180,7 +180,7 @@ def _run(
         result = adjust(problem, state, config.lm, progress)
         starts = [_moved(start, result, i, refine) for i, start in enumerate(starts)]
     inlier = result.inlier
-    covariance = camera_covariance(result.state, result.system, inlier.any(1), result.sigma_px)
+    covariance = camera_covariance(problem, result.state, inlier, result.sigma_px, result.shape_weight)
     inlier, covariance = inlier.cpu(), covariance.cpu()
     sigma, weight = result.sigma_px.tolist(), result.shape_weight.tolist()
     iterations, converged = result.iterations.tolist(), result.converged.tolist()
@@ -255,9 +255,7 @@ def measured(
         known = replace(start, points=start.points.nan_to_num(0.0))
         problem, state = _problem([known], len(scene), (), None)
         one = torch.ones(1, dtype=torch.float64)
-        weight = inlier[None].to(torch.float64)
-        system = linearise(problem, state, residuals(problem, state), weight, one * sigma_px**2, one)
-        covariance = camera_covariance(state, system, inlier[None].any(1), one * sigma_px)[0]
+        covariance = camera_covariance(problem, state, inlier[None], one * sigma_px, one)[0]
     return Attempt(start, initial_c2w, inlier, sigma_px, 1.0, covariance, iterations, True, history)
 
 

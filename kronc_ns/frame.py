@@ -17,7 +17,7 @@ def rough_frame(points: Float[Tensor, "j 3"], template: CarTemplate) -> Similari
     known = points.isfinite().all(-1)
     source, mean = points[known], template.mean[known]
     similarity = umeyama(source, mean)
-    for _ in range(3):
+    for _ in range(2):
         off = (similarity.apply(source) - mean).norm(dim=-1)
         similarity = umeyama(source, mean, 1 / (1 + (off / _OFF_M).square()))
     return similarity

@@ -3,8 +3,10 @@
 import hashlib
 import json
 import math
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import PurePosixPath
 from typing import Literal
@@ -40,6 +42,7 @@ from kronc_ns.solve.threads import one_thread
 from kronc_ns.verify import Evidence, verify
 
 _FORMAT = 2  # raised whenever the same input and options give another solution
+_TOGETHER = 4  # scenes that go through the stages together
 _GOOD_SHARE = 0.9  # views that agree, from which on no other start is tried
 _GOOD_SIGMA = 0.004  # of the image diagonal: noise of a fit that is believed at once
 
@@ -66,29 +69,37 @@ def solve_scenes(
     ``progress`` is told the solver's steps of a single scene, else how many scenes are done.
     """
     config = config or KroncConfig()
+    if len(scenes) == 1:
+        with one_thread():
+            return _solve_some(scenes, config, progress)
+    groups = [scenes[first : first + _TOGETHER] for first in range(0, len(scenes), _TOGETHER)]
+    outcome: list[Solution | KroncError] = []
+    with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        for solutions in pool.map(lambda group: _solve_some(group, config, None), groups):
+            outcome += solutions
+            if progress is not None:
+                progress(len(outcome), len(scenes), math.nan)
+    return outcome
+
+
+def _solve_some(scenes: Sequence[Scene], config: KroncConfig, progress: Progress | None) -> list[Solution | KroncError]:
+    """Scenes that share batches, on one thread of the processor."""
     start = time.perf_counter()
-    found: dict[int, Attempt] = {}
     outcome: list[Solution | KroncError | None] = [None] * len(scenes)
-    possible = []
+    possible: list[int] = []
     for i, scene in enumerate(scenes):
         try:
             _check(scene, config)
             possible.append(i)
         except KroncError as error:
             outcome[i] = error
-    with one_thread():
-        if config.solver == "adam":
-            for i in possible:
-                found[i] = _adam(scenes[i], config, progress)
-        else:
-            report = _steps(progress, config) if len(scenes) == 1 else None
-            attempts = _lm([scenes[i] for i in possible], config, report)
-            found = dict(zip(possible, attempts, strict=True))
-        for done, (i, attempt) in enumerate(found.items(), start=1):
-            outcome[i] = _finish(scenes[i], attempt, config)
-            if progress is not None and len(scenes) > 1:
-                progress(done, len(scenes), math.nan)
-    seconds = (time.perf_counter() - start) / max(1, len(found))
+    if config.solver == "lm":
+        attempts: Iterable[Attempt | KroncError] = _lm([scenes[i] for i in possible], config, _steps(progress, config))
+    else:
+        attempts = (_adam(scenes[i], config, progress) for i in possible)
+    for i, attempt in zip(possible, attempts, strict=True):
+        outcome[i] = attempt if isinstance(attempt, KroncError) else _finish(scenes[i], attempt, config)
+    seconds = (time.perf_counter() - start) / max(1, len(scenes))
     return [replace(x, seconds=seconds) if isinstance(x, Solution) else x for x in outcome if x is not None]
 
 
@@ -196,7 +207,7 @@ def _good(attempt: Attempt, scene: Scene) -> bool:
     return agreeing >= max(1, _GOOD_SHARE * int(usable.sum())) and attempt.sigma_px < _GOOD_SIGMA * diagonal
 
 
-def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attempt:
+def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attempt | KroncError:
     """Algorithm 1 on the usable views, in float32."""
     given = scene.given_c2w is not None and config.init in ("auto", "given")
     name: Literal["given", "circular"] = "given" if given else "circular"
@@ -212,7 +223,7 @@ def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attem
     seen = (scene.visibility * usable[:, None]).sum(0) >= 2
     points = torch.where(seen[:, None], result.points.double().cpu(), math.nan)
     if not (c2w[usable].isfinite().all() and points[seen].isfinite().all()):
-        raise KroncError(
+        return KroncError(
             "the optimisation diverged to values that are not finite: lower adam.learning_rate or mend the start"
         )
     start = Start(name, scene, c2w, points, usable, torch.zeros_like(usable))

@@ -1,6 +1,7 @@
 """Rotations: the 6D representation of the paper and the exponential map of SO(3)."""
 
 import math
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -22,10 +23,16 @@ def rotation_from_r6(r6: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:
 
 def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Matrix of the cross product: ``skew(a) @ b = a x b``."""
-    generators = torch.zeros(3, 3, 3, dtype=vector.dtype, device=vector.device)
+    return (vector @ _generators(vector.dtype, vector.device)).unflatten(-1, (3, 3))
+
+
+@lru_cache(maxsize=8)
+def _generators(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 9"]:
+    """The three matrices of the cross product with a unit axis, flattened."""
+    basis = torch.zeros(3, 3, 3, dtype=dtype, device=device)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        generators[i, k, j], generators[i, j, k] = 1.0, -1.0
-    return (vector @ generators.view(3, 9)).unflatten(-1, (3, 3))
+        basis[i, k, j], basis[i, j, k] = 1.0, -1.0
+    return basis.view(3, 9)
 
 
 def so3_exp(omega: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:

@@ -17,9 +17,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from kronc_ns.geometry.rotations import so3_exp
+from kronc_ns.solve import bundle_cpu
 
-_BEHIND_PX = 1e4  # residual of a point behind its camera: an outlier to every robust loss
-_NEAR = 1e-6  # smallest z that is "in front", in world units
 _TINY = 1e-12
 
 
@@ -126,7 +125,11 @@ class Residuals(Batched):
     error: Float[Tensor, "b n 2 j"]
     """Projection minus detection in pixels; 0 where nothing is seen."""
     norm: Float[Tensor, "b n j"]
-    """Length of the error in pixels times the root of its weight; `_BEHIND_PX` behind the camera."""
+    """Length of the error in pixels times the root of its weight; `BEHIND_PX` behind the camera."""
+    surprise: Float[Tensor, "b"]
+    """Squared Mahalanobis distance of the points under the shape prior; 0 without one."""
+    pull: Float[Tensor, "b p"]
+    """Half its gradient by the points."""
 
 
 def focal_of(problem: Problem, state: State) -> Float[Tensor, "b 2"]:
@@ -138,20 +141,45 @@ def focal_of(problem: Problem, state: State) -> Float[Tensor, "b 2"]:
 
 def residuals(problem: Problem, state: State) -> Residuals:
     """Reproject all points."""
+    plane, inverse_z, error, norm = (_reproject_compiled if _compiled(problem) else _reproject)(problem, state)
+    if problem.shape is None or problem.points_known:
+        nothing = norm.new_zeros(len(norm))
+        return Residuals(plane, inverse_z, error, norm, nothing, nothing[:, None])
+    deviation = state.points.transpose(1, 2).flatten(1) - problem.shape.mean
+    pull = deviation @ problem.shape.precision
+    return Residuals(plane, inverse_z, error, norm, (pull * deviation).sum(1), pull)
+
+
+def _compiled(problem: Problem) -> bool:
+    """Whether the kernels for the CPU serve."""
+    return problem.weight.device.type == "cpu" and problem.weight.dtype == torch.float64 and not problem.refine
+
+
+def _reproject_compiled(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    b, n, _, j = problem.uv.shape
+    plane, inverse_z, error = (problem.uv.new_empty(b, n, rows, j) for rows in (2, 1, 2))
+    norm = torch.empty_like(problem.weight)
+    given = (state.rotation, state.translation, state.points, problem.uv, problem.weight, problem.focal)
+    bundle_cpu.reproject(*(x.contiguous().numpy() for x in (*given, plane, inverse_z, error, norm)))
+    return plane, inverse_z, error, norm
+
+
+def _reproject(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     camera = torch.matmul(state.rotation, state.points.transpose(-1, -2)[:, None]) + state.translation[..., None]
     z = camera[:, :, 2:]
-    behind = z < _NEAR
-    inverse_z = z.clamp_min(_NEAR).reciprocal()
+    behind = z < bundle_cpu.NEAR
+    inverse_z = z.clamp_min(bundle_cpu.NEAR).reciprocal()
     plane = camera[:, :, :2] * inverse_z
     image = plane
     if "k1" in problem.refine:
         k1 = state.intrinsics[:, problem.refine.index("k1"), None, None, None]
         image = plane * (1 + k1 * plane.square().sum(2, keepdim=True))
     seen = problem.weight > 0
-    error = image * focal_of(problem, state)[:, None, :, None] - problem.uv
-    error = error * (seen[:, :, None] & ~behind)
-    norm = (error.square().sum(2) * problem.weight).sqrt()
-    return Residuals(plane, inverse_z, error, torch.where(behind[:, :, 0] & seen, _BEHIND_PX, norm))
+    error = torch.addcmul(-problem.uv, image, focal_of(problem, state)[:, None, :, None])
+    error.masked_fill_(behind | ~seen[:, :, None], 0.0)
+    norm = error.square().sum(2).mul_(problem.weight).sqrt_()
+    norm.masked_fill_(behind[:, :, 0] & seen, bundle_cpu.BEHIND_PX)
+    return plane, inverse_z, error, norm
 
 
 @dataclass(frozen=True)
@@ -178,23 +206,18 @@ def linearise(
     focal = focal_of(problem, state)[:, None, :, None]
     root = (weight * problem.weight).sqrt()[:, :, None]
     scale = root * focal  # [b, n, 2, j]
+    # a point n = (x, y, 1) z of the camera moves by w x n z + v: E holds -[n]x and 1/z, for either axis of the image
+    # the rows against (w, v) are E_0 - x E_2 and E_1 - y E_2; A[b, n, 6, 2, j] is scaled to pixels
     x, y = residual.plane.unbind(2)
-    near = residual.inverse_z[:, :, 0]
-    # rows of both image axes against (w, v): A[b, n, 6, 2, j]
-    a = x.new_empty(b, n, 6, 2, j)
-    xy = x * y
-    torch.neg(xy, out=a[:, :, 0, 0])
-    torch.add(x * x, 1.0, out=a[:, :, 1, 0])
-    torch.neg(y, out=a[:, :, 2, 0])
-    a[:, :, 3, 0] = near
-    a[:, :, 4, 0] = 0.0
-    torch.mul(x, near, out=a[:, :, 5, 0]).neg_()
-    torch.add(y * y, 1.0, out=a[:, :, 0, 1]).neg_()
-    a[:, :, 1, 1] = xy
-    a[:, :, 2, 1] = x
-    a[:, :, 3, 1] = 0.0
-    a[:, :, 4, 1] = near
-    torch.mul(y, near, out=a[:, :, 5, 1]).neg_()
+    e = x.new_zeros(b, n, 6, 3, j)
+    e[:, :, 1, 0], e[:, :, 0, 1] = 1.0, -1.0
+    torch.neg(y, out=e[:, :, 2, 0])
+    e[:, :, 2, 1] = x
+    e[:, :, 0, 2] = y
+    torch.neg(x, out=e[:, :, 1, 2])
+    e[:, :, 3:].diagonal(dim1=2, dim2=3).copy_(residual.inverse_z.transpose(2, 3))
+    a = torch.mul(e[:, :, :, 2:], residual.plane[:, :, None])
+    torch.sub(e[:, :, :, :2], a, out=a)
     a.mul_(scale[:, :, None])
     error = root * residual.error
     flat = a.view(b, n, 6, 2 * j)
@@ -202,6 +225,7 @@ def linearise(
     camera_gradient = flat @ error.reshape(b, n, 2 * j, 1)
     if problem.orbit is not None:
         _add_orbit(problem.orbit, state, variance, camera, camera_gradient[..., 0])
+    _fill_diagonal(camera)
     if problem.points_known:
         return Linearisation(camera, camera_gradient, x.new_zeros(b, 0, 0), x.new_zeros(b, 0))
 
@@ -234,12 +258,16 @@ def linearise(
         point[:, 3 * j :, : 3 * j] = cross.transpose(1, 2)
         point[:, 3 * j :, 3 * j :] = (by_column @ by_column.transpose(-1, -2)).sum(1)
         gradient[:, 3 * j :] = (by_column @ error_by_point)[..., 0].sum(1)
-    if problem.shape is not None:
-        strength = variance * shape_weight
-        point[:, : 3 * j, : 3 * j].addcmul_(strength[:, None, None].expand(b, 3 * j, 1), problem.shape.precision)
-        deviation = state.points.transpose(1, 2).flatten(1) - problem.shape.mean
-        gradient[:, : 3 * j].addcmul_(strength[:, None], deviation @ problem.shape.precision)
+    _add_shape(problem, residual, variance * shape_weight, point, gradient)
+    _fill_diagonal(point)
     return Linearisation(camera, coupling, point, gradient)
+
+
+def _add_shape(problem: Problem, residual: Residuals, strength: Tensor, point: Tensor, gradient: Tensor) -> None:
+    if problem.shape is not None:
+        size = len(problem.shape.mean)
+        point[:, :size, :size].addcmul_(strength[:, None, None].expand(len(point), size, 1), problem.shape.precision)
+        gradient[:, :size].addcmul_(strength[:, None], residual.pull)
 
 
 def _add_orbit(orbit: OrbitPrior, state: State, variance: Tensor, camera: Tensor, camera_gradient: Tensor) -> None:
@@ -269,31 +297,58 @@ class Reduced:
     whitened: Float[Tensor, "b c q"]
     """The c = 6N rows of the cameras times ``whitener``; the last column is their gradient."""
     matrix: Float[Tensor, "b p p"]
+    """Symmetric; only the lower triangle is sure to be there."""
     rhs: Float[Tensor, "b p"]
+
+
+def reduce_system(
+    problem: Problem,
+    state: State,
+    residual: Residuals,
+    weight: Float[Tensor, "b n j"],
+    variance: Float[Tensor, "b"],
+    shape_weight: Float[Tensor, "b"],
+    damping: Float[Tensor, "b"],
+) -> Reduced:
+    """`linearise` and `eliminate_cameras`; compiled where that serves."""
+    if problem.points_known or problem.orbit is not None or not _compiled(problem):
+        system = linearise(problem, state, residual, weight, variance, shape_weight)
+        return eliminate_cameras(system, damping)
+    b, n, _, j = problem.uv.shape
+    whitener, whitened = problem.uv.new_empty(b, n, 6, 6), problem.uv.new_zeros(b, n, 6, 3 * j + 1)
+    point, product = problem.uv.new_zeros(2, b, 3 * j, 3 * j)
+    gradient, carried = problem.uv.new_zeros(2, b, 3 * j)
+    given = (state.rotation, residual.plane, residual.inverse_z, residual.error, weight * problem.weight)
+    out = (whitener, whitened, point, product, gradient, carried)
+    bundle_cpu.reduce_system(*(x.contiguous().numpy() for x in (*given, problem.focal, damping, *out)))
+    _add_shape(problem, residual, variance * shape_weight, point, gradient)
+    _fill_diagonal(point)
+    point.diagonal(dim1=-2, dim2=-1).mul_(1 + damping[:, None])
+    return Reduced(whitener, whitened.view(b, 6 * n, 3 * j + 1), point.sub_(product), carried.sub_(gradient))
 
 
 def eliminate_cameras(system: Linearisation, damping: Float[Tensor, "b"]) -> Reduced:
     """Schur complement of the cameras, with Marquardt's damping on all unknowns."""
     b, n = system.camera.shape[:2]
-    growth = 1 + damping
+    growth = 1 + damping[:, None]
     camera = system.camera.clone()
-    _grow_diagonal(camera, growth[:, None])
+    camera.diagonal(dim1=-2, dim2=-1).mul_(growth[:, None])
     factor = torch.linalg.cholesky_ex(camera).L
     whitener = torch.linalg.solve_triangular(factor, torch.eye(6).to(factor), upper=False)
     whitened = whitener @ system.coupling
     size = system.point.shape[-1]
     tall = whitened.view(b, 6 * n, size + 1)
     point = system.point.clone()
-    _grow_diagonal(point, growth)
+    point.diagonal(dim1=-2, dim2=-1).mul_(growth)
     product = tall[..., :size].transpose(1, 2) @ tall
     matrix = point.sub_(product[..., :size])
     return Reduced(whitener, tall, matrix, product[..., size] - system.point_gradient)
 
 
-def _grow_diagonal(matrix: Tensor, growth: Tensor) -> None:
-    """Marquardt: multiply the diagonal in place, and keep it off zero (an unseen point, an empty view)."""
+def _fill_diagonal(matrix: Tensor) -> None:
+    """Keep the diagonal off zero (an unseen point, an empty view): its unknowns then stay where they are."""
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    diagonal.mul_(growth[..., None]).add_(torch.where(diagonal > _TINY, 0.0, 1.0))
+    diagonal.masked_fill_(diagonal <= _TINY, 1.0)
 
 
 @dataclass(frozen=True)

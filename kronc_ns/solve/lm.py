@@ -18,14 +18,12 @@ from typing_extensions import assert_never
 
 from kronc_ns.solve.bundle import (
     Batched,
-    Linearisation,
     Problem,
     Residuals,
     State,
-    eliminate_cameras,
-    linearise,
     move,
     orbit_error,
+    reduce_system,
     residuals,
     solve_step,
 )
@@ -67,8 +65,6 @@ class LmResult:
     inlier: Bool[Tensor, "b n j"]
     shape_weight: Float[Tensor, "b"]
     """What the shape prior counted at last: 1 for a usual shape, less for an unusual one."""
-    system: Linearisation
-    """Undamped normal equations of the last step, for `camera_covariance`."""
     iterations: Int[Tensor, "b"]
     converged: Bool[Tensor, "b"]
     history: dict[str, list[float]] = field(default_factory=dict)
@@ -87,14 +83,6 @@ class _Search(Batched):
     cost: Float[Tensor, "b"]
     damping: Float[Tensor, "b"]
     rounds: Int[Tensor, "b"]
-
-
-@dataclass(frozen=True)
-class _Finished(Batched):
-    """What is kept of a scene that leaves the batch."""
-
-    search: _Search
-    system: Linearisation
 
 
 def adjust(
@@ -127,15 +115,13 @@ def _adjust(
         rounds=torch.zeros(scenes, dtype=torch.long, device=problem.uv.device),
     )
     search = replace(search, cost=_cost(problem, search, config))
-    finished = None
+    finished = search
     steps = torch.zeros(scenes, dtype=torch.long, device=problem.uv.device)
     converged = torch.zeros(scenes, dtype=torch.bool, device=problem.uv.device)
     history: dict[str, list[float]] = {"step": [], "loss": []}
     detections = max(1, int((problem.weight[0] > 0).sum()))
     for step in range(1, config.iterations + 1):
-        weight, shape_weight = _irls_weight(search, config), _shape_weight(problem, search.state)
-        system = linearise(problem, search.state, search.residual, weight, search.sigma.square(), shape_weight)
-        search, done = _iterate(problem, search, system, counts, config)
+        search, done = _iterate(problem, search, counts, config)
         steps[search.scene] = step
         if search.scene[0] == 0:
             loss = math.sqrt(float(search.cost[0]) / detections)
@@ -145,32 +131,37 @@ def _adjust(
                 progress(step, loss)
         converged[search.scene[done]] = True
         leaving = done if step < config.iterations else torch.ones_like(done)
-        if leaving.any() or finished is None:
-            finished = _store(finished, _Finished(search, system), leaving)
+        if leaving.any():
+            finished = _store(finished, search, leaving)
             keep = torch.nonzero(~leaving)[:, 0]
             if not len(keep):
                 break
             problem, search, counts = problem[keep], search[keep], counts[keep]
-    assert finished is not None
-    final, sigma = finished.search, finished.search.sigma
+    sigma = finished.sigma
     return LmResult(
-        state=final.state,
-        cost=final.cost / sigma.square(),
+        state=finished.state,
+        cost=finished.cost / sigma.square(),
         sigma_px=sigma,
-        inlier=(whole.weight > 0) & (final.residual.norm <= _TRIM_SIGMAS * sigma[:, None, None]),
-        shape_weight=_shape_weight(whole, final.state),
-        system=finished.system,
+        inlier=(whole.weight > 0) & (finished.residual.norm <= _TRIM_SIGMAS * sigma[:, None, None]),
+        shape_weight=_shape_weight(whole, finished.residual),
         iterations=steps,
         converged=converged,
         history=history,
     )
 
 
-def _iterate(
-    problem: Problem, search: _Search, system: Linearisation, counts: Tensor, config: LmConfig
-) -> tuple[_Search, Bool[Tensor, "b"]]:
+def _iterate(problem: Problem, search: _Search, counts: Tensor, config: LmConfig) -> tuple[_Search, Bool[Tensor, "b"]]:
     """One damped step of every scene in the batch, and which scenes are finished."""
-    trial = move(search.state, solve_step(eliminate_cameras(system, search.damping), problem.uv.shape[3]))
+    reduced = reduce_system(
+        problem,
+        search.state,
+        search.residual,
+        _irls_weight(search, config),
+        search.sigma.square(),
+        _shape_weight(problem, search.residual),
+        search.damping,
+    )
+    trial = move(search.state, solve_step(reduced, problem.uv.shape[3]))
     attempt = replace(search, state=trial, residual=residuals(problem, trial))
     cost = _cost(problem, attempt, config)
     better = cost < search.cost  # false for NaN
@@ -192,28 +183,31 @@ def _anneal(
         return search, settled
     shrunk = torch.minimum(search.sigma, _robust_sigma(problem, search.residual) * counts)
     sigma = torch.where(robust, shrunk, search.sigma)
-    if config.loss != "cauchy":
-        return _with_sigma(problem, search, sigma, search.phase, config), settled
-    done = torch.zeros_like(settled)
-    phase, rounds = search.phase, search.rounds
-    if settled.any():
-        seen, norm = problem.weight > 0, search.residual.norm
-        inlier = seen & (norm <= _TRIM_SIGMAS * sigma[:, None, None])
-        found = inlier.sum((1, 2)).clamp_min(1)
-        spread = (torch.where(inlier, norm.square(), 0.0).sum((1, 2)) / (2 * found)).sqrt() * counts
-        spread = torch.minimum(spread.clamp_min(_SIGMA_FLOOR_PX), shrunk)
-        again = seen & (norm <= _TRIM_SIGMAS * spread[:, None, None])
-        loose = spread < _LOOSE * sigma  # the scale lags far behind the residuals: on with the robust phase
-        phase = torch.where(settled, torch.where(loose, _ROBUST, _TRIMMED), phase)
-        rounds = rounds + settled
-        done = settled & ~robust & ~loose & (again == inlier).all(2).all(1) | (rounds >= _ROUNDS)
-        sigma = torch.where(settled & ~done & (loose | ~robust), spread, sigma)
-    return _with_sigma(problem, replace(search, rounds=rounds), sigma, phase, config), done
+    done = settled
+    if config.loss == "cauchy":
+        done = torch.zeros_like(settled)
+        if settled.any():
+            search, sigma, done = _next_phase(problem, replace(search, sigma=sigma), settled, shrunk, counts)
+    search = replace(search, sigma=sigma)
+    return replace(search, cost=_cost(problem, search, config)), done
 
 
-def _with_sigma(problem: Problem, search: _Search, sigma: Tensor, phase: Tensor, config: LmConfig) -> _Search:
-    search = replace(search, sigma=sigma, phase=phase)
-    return replace(search, cost=_cost(problem, search, config))
+def _next_phase(
+    problem: Problem, search: _Search, settled: Bool[Tensor, "b"], shrunk: Float[Tensor, "b"], counts: Tensor
+) -> tuple[_Search, Float[Tensor, "b"], Bool[Tensor, "b"]]:
+    """From the graduated loss to the trimmed squares, and to the end when the choice of inliers stands."""
+    robust, seen, norm, sigma = search.phase == _ROBUST, problem.weight > 0, search.residual.norm, search.sigma
+    inlier = seen & (norm <= _TRIM_SIGMAS * sigma[:, None, None])
+    found = inlier.sum((1, 2)).clamp_min(1)
+    spread = (torch.where(inlier, norm.square(), 0.0).sum((1, 2)) / (2 * found)).sqrt() * counts
+    spread = torch.minimum(spread.clamp_min(_SIGMA_FLOOR_PX), shrunk)
+    again = seen & (norm <= _TRIM_SIGMAS * spread[:, None, None])
+    loose = spread < _LOOSE * sigma  # the scale lags far behind the residuals: on with the robust phase
+    rounds = search.rounds + settled
+    done = (settled & ~robust & ~loose & (again == inlier).all(2).all(1)) | (rounds >= _ROUNDS)
+    phase = torch.where(settled, torch.where(loose, _ROBUST, _TRIMMED), search.phase)
+    sigma = torch.where(settled & ~done & (loose | ~robust), spread, sigma)
+    return replace(search, phase=phase, rounds=rounds), sigma, done
 
 
 def _choose(chosen: Bool[Tensor, "b"], yes: _Search, no: _Search) -> _Search:
@@ -223,11 +217,11 @@ def _choose(chosen: Bool[Tensor, "b"], yes: _Search, no: _Search) -> _Search:
     return yes.each(lambda a, b: torch.where(chosen.view(-1, *[1] * (a.ndim - 1)), a, b), no)
 
 
-def _store(finished: _Finished | None, present: _Finished, chosen: Bool[Tensor, "b"]) -> _Finished:
+def _store(finished: _Search, search: _Search, chosen: Bool[Tensor, "b"]) -> _Search:
     """What is kept of all scenes, with the chosen ones of those still in the batch."""
-    if finished is None or (len(chosen) == len(finished.search.scene) and bool(chosen.all())):
-        return present
-    return finished.each(lambda a, b: a.index_copy(0, present.search.scene[chosen], b[chosen]), present)
+    if len(chosen) == len(finished.scene) and bool(chosen.all()):
+        return search
+    return finished.each(lambda a, b: a.index_copy(0, search.scene[chosen], b[chosen]), search)
 
 
 def _robust_sigma(problem: Problem, residual: Residuals) -> Float[Tensor, "b"]:
@@ -249,9 +243,14 @@ def _irls_weight(search: _Search, config: LmConfig) -> Float[Tensor, "b n j"]:
     norm, sigma = search.residual.norm, search.sigma[:, None, None]
     match config.loss:
         case "cauchy":
-            robust = 1 / (1 + (norm / (_CAUCHY_SIGMAS * sigma)).square())
-            trimmed = (norm <= _TRIM_SIGMAS * sigma).to(norm.dtype)
-            return torch.where(search.phase[:, None, None] == _ROBUST, robust, trimmed)
+            robust = search.phase == _ROBUST
+            # while all scenes are in the same phase, as a single one is, only that phase's weight is computed
+            weight = None if robust.all() else (norm <= _TRIM_SIGMAS * sigma).to(norm.dtype)
+            if robust.any():
+                graduated = 1 / (1 + (norm / (_CAUCHY_SIGMAS * sigma)).square())
+                weight = graduated if weight is None else torch.where(robust[:, None, None], graduated, weight)
+            assert weight is not None
+            return weight
         case "huber":
             return (_HUBER_SIGMAS * sigma / norm.clamp_min(1e-12)).clamp(max=1.0)
         case "none":
@@ -262,16 +261,19 @@ def _irls_weight(search: _Search, config: LmConfig) -> Float[Tensor, "b n j"]:
 
 def _cost(problem: Problem, search: _Search, config: LmConfig) -> Float[Tensor, "b"]:
     """What is minimised, in squared pixels."""
-    norm, sigma = search.residual.norm, search.sigma[:, None, None]
+    norm, sigma = search.residual.norm, search.sigma
     square = norm.square()
     match config.loss:
         case "cauchy":
-            scale = (_CAUCHY_SIGMAS * sigma).square()
-            robust = scale * torch.log1p(square / scale)
-            trimmed = torch.minimum(square, (_TRIM_SIGMAS * sigma).square())
-            value = torch.where(search.phase[:, None, None] == _ROBUST, robust, trimmed)
+            robust = search.phase == _ROBUST
+            value = None if robust.all() else torch.minimum(square, (_TRIM_SIGMAS * sigma).square()[:, None, None])
+            if robust.any():
+                scale = (_CAUCHY_SIGMAS * sigma).square()[:, None, None]
+                graduated = torch.log1p(square / scale).mul_(scale)
+                value = graduated if value is None else torch.where(robust[:, None, None], graduated, value)
+            assert value is not None
         case "huber":
-            knee = _HUBER_SIGMAS * sigma
+            knee = _HUBER_SIGMAS * sigma[:, None, None]
             value = torch.where(norm <= knee, square, 2 * knee * norm - knee.square())
         case "none":
             value = square
@@ -279,25 +281,19 @@ def _cost(problem: Problem, search: _Search, config: LmConfig) -> Float[Tensor, 
             assert_never(config.loss)
     cost = value.sum((1, 2))
     if problem.shape is not None and not problem.points_known:
-        freedom, size = problem.shape.freedom, search.state.points[0].numel()
-        square = _mahalanobis(problem, search.state)
-        tail = size + (freedom + size) * ((freedom + square.clamp_min(size)) / (freedom + size)).log()
-        cost = cost + search.sigma.square() * torch.where(square <= size, square, tail)
+        surprise, size = search.residual.surprise, search.residual.pull.shape[1]
+        freedom = problem.shape.freedom
+        tail = size + (freedom + size) * ((freedom + surprise.clamp_min(size)) / (freedom + size)).log()
+        cost = cost + sigma.square() * torch.where(surprise <= size, surprise, tail)
     if problem.orbit is not None:
         error = orbit_error(problem.orbit, search.state).square().sum(-1) / problem.orbit.sigma.square()
-        cost = cost + search.sigma.square() * error.sum(1)
+        cost = cost + sigma.square() * error.sum(1)
     return cost
 
 
-def _mahalanobis(problem: Problem, state: State) -> Float[Tensor, "b"]:
-    assert problem.shape is not None
-    deviation = state.points.transpose(1, 2).flatten(1) - problem.shape.mean
-    return ((deviation @ problem.shape.precision) * deviation).sum(1)
-
-
-def _shape_weight(problem: Problem, state: State) -> Float[Tensor, "b"]:
+def _shape_weight(problem: Problem, residual: Residuals) -> Float[Tensor, "b"]:
     """IRLS weight of the shape prior: 1 for a usual shape, falling like a Student t's for an unusual one."""
     if problem.shape is None or problem.points_known:
-        return state.points.new_ones(len(state.points))
+        return torch.ones_like(residual.surprise)
     freedom = problem.shape.freedom
-    return ((freedom + state.points[0].numel()) / (freedom + _mahalanobis(problem, state))).clamp(max=1.0)
+    return ((freedom + residual.pull.shape[1]) / (freedom + residual.surprise)).clamp(max=1.0)

@@ -5,21 +5,36 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from kronc_ns.geometry.rotations import skew
-from kronc_ns.solve.bundle import Linearisation, State, eliminate_cameras
+from kronc_ns.solve.bundle import Problem, State, reduce_system, residuals
+
+_DAMPING = 1e-9  # keeps the gauge's zero pivots positive
 
 
 def camera_covariance(
-    state: State, system: Linearisation, seen: Bool[Tensor, "b j"], sigma_px: Float[Tensor, "b"]
+    problem: Problem,
+    state: State,
+    inlier: Bool[Tensor, "b n j"],
+    sigma_px: Float[Tensor, "b"],
+    shape_weight: Float[Tensor, "b"],
 ) -> Float[Tensor, "b n 6 6"]:
     """Covariance of each camera's (rotation vector in radians, centre) in its own axes, the points held still.
 
-    ``system`` are the normal equations at the solution, ``seen`` the points that take part. Still means: no common
-    shift, turn or growth of these points (inner constraints; docs/solver.md), so what remains is the camera's error
-    relative to the object. Cameras without detections get what the system knows of them: nothing (a huge covariance).
+    Still means: no common shift, turn or growth of the points that are seen (inner constraints; docs/solver.md), so
+    what remains is the camera's error relative to the object. Cameras without detections get what the system knows of
+    them: nothing (a huge covariance).
     """
-    b, n = system.camera.shape[:2]
-    size = system.point.shape[-1]
-    reduced = eliminate_cameras(system, torch.full_like(sigma_px, 1e-9))
+    b, n, _ = inlier.shape
+    seen = (inlier & (problem.weight > 0)).any(1)
+    reduced = reduce_system(
+        problem,
+        state,
+        residuals(problem, state),
+        inlier.to(problem.weight.dtype),
+        sigma_px.square(),
+        shape_weight,
+        torch.full_like(sigma_px, _DAMPING),
+    )
+    size = reduced.rhs.shape[1]
     gauge, motion = _gauge(state, seen, size)
     # any generalised inverse will do, since the gauge is projected out below; a stiff spring makes the matrix regular
     stiffness = reduced.matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
