@@ -24,7 +24,7 @@ from kronc_ns.options import KroncConfig
 from kronc_ns.scene import Scene
 from kronc_ns.solve.bundle import Problem, ShapePrior, State
 from kronc_ns.solve.lm import LmResult, adjust
-from kronc_ns.solve.resection import AWAY, locate
+from kronc_ns.solve.resection import AWAY, locate, unexplained
 from kronc_ns.solve.uncertainty import camera_covariance
 
 MIN_POINTS = 4
@@ -32,6 +32,7 @@ MIN_POINTS = 4
 _NO_CHANCE = 8  # a pose can be bent to meet three detections; eight do not agree by accident
 _ALL_LAPS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 _TEMPLATE_TOLERANCE = 0.03  # of the car's extent in the image: about 13 cm on the car
+_TOLERANCE_SIGMAS = 3.0  # likewise, once the points are solved
 _LOST = 0.8  # mean robust cost of a view's detections from which on its pose says nothing
 _SWAP_GAIN = 0.7  # a view is taken for left-right swapped where that lowers its cost below this share
 _ODD_SHARE = 0.3  # share of a view's detections on the far side of the car that makes the view suspect
@@ -319,7 +320,8 @@ def _suspects(attempt: Attempt) -> Bool[Tensor, "n"]:
     start = attempt.start
     seen = start.scene.visibility > 0
     away = (far_side(start) & seen).sum(1) > _ODD_SHARE * seen.sum(1)
-    return usable_views(start.scene) & (~attempt.agreeing | away)
+    few = 2 * attempt.inlier.sum(1) < seen.sum(1)
+    return usable_views(start.scene) & (~attempt.agreeing | few | away)
 
 
 def _relocated(attempt: Attempt, suspect: Bool[Tensor, "n"]) -> Start:
@@ -329,16 +331,31 @@ def _relocated(attempt: Attempt, suspect: Bool[Tensor, "n"]) -> Start:
     trusted = (attempt.inlier & ~suspect[:, None]).sum(0) >= 2
     points = torch.where(trusted[:, None], start.points, math.nan)
     c2w, cost, swapped = _locate(scene, points, suspect, attempt.sigma_px)
-    keypoints = torch.where(
-        (suspect & swapped)[:, None, None], mirrored(scene.keypoints, scene.schema), scene.keypoints
-    )
+    better = suspect & (cost < _present_cost(start, points, attempt.sigma_px))
+    swapped &= better
+    keypoints = torch.where(swapped[:, None, None], mirrored(scene.keypoints, scene.schema), scene.keypoints)
     return replace(
         start,
         scene=replace(scene, keypoints=keypoints),
-        c2w=torch.where(suspect[:, None, None], c2w, start.c2w),
-        used=torch.where(suspect, cost < _LOST, start.used),
-        swapped=start.swapped ^ (suspect & swapped),
+        c2w=torch.where(better[:, None, None], c2w, start.c2w),
+        used=torch.where(better, cost < _LOST, start.used & (attempt.agreeing | ~suspect)),
+        swapped=start.swapped ^ swapped,
     )
+
+
+def _present_cost(start: Start, points: Float[Tensor, "j 3"], sigma_px: float) -> Float[Tensor, "n"]:
+    """Cost of every view where it is, as `locate` reckons it; inf where it has no pose."""
+    scene, template = start.scene, car_template(start.scene.schema)
+    error = (objective.reproject(points, start.c2w, scene.camera) - scene.uv).norm(dim=-1)
+    cost = unexplained(
+        torch.where(in_front(start), error, math.inf),
+        torch.where(points.isfinite().all(-1), scene.visibility, 0.0),
+        start.c2w,
+        points.expand(len(scene), -1, -1),
+        torch.full((len(scene),), _TOLERANCE_SIGMAS * sigma_px, dtype=torch.float64),
+        None if template is None else template.normals,
+    )
+    return torch.where(start.used, cost.nan_to_num(math.inf), math.inf)
 
 
 def _locate(
@@ -358,7 +375,7 @@ def _locate(
         spread = torch.where(m[..., None], uv, -math.inf).amax(1) - torch.where(m[..., None], uv, math.inf).amin(1)
         tolerance = _TEMPLATE_TOLERANCE * spread.amax(1)
     else:
-        tolerance = torch.full((len(detected),), 3 * sigma_px, dtype=torch.float64)
+        tolerance = torch.full((len(detected),), _TOLERANCE_SIGMAS * sigma_px, dtype=torch.float64)
     focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
     found = locate(
         points.expand(len(detected), -1, -1),
@@ -367,6 +384,7 @@ def _locate(
         focal.expand(len(detected), 2),
         tolerance,
         None if template is None else template.normals,
+        exact=sigma_px is not None,
     )
     poses, costs = invert(found.w2c).unflatten(0, (len(variants), -1)), found.cost.view(len(variants), -1)
     flipped = costs[-1] < _SWAP_GAIN * costs[0]

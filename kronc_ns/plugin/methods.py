@@ -1,8 +1,12 @@
 """Method presets, each a documented difference from nerfstudio's own default."""
 
+from typing import Any
+
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
@@ -12,6 +16,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from kronc_ns.plugin.compatibility import allow_numpy_in_checkpoints, train_without_lpips_weights
 from kronc_ns.plugin.dataparser import KroncDataParserConfig
+from kronc_ns.plugin.dvgo.model import DVGOModelConfig
 
 allow_numpy_in_checkpoints()
 train_without_lpips_weights()
@@ -97,4 +102,89 @@ kronc_tensorf_cpu = MethodSpecification(
         vis="tensorboard",
     ),
     description="TensoRF on KRONC poses, sized to train in a few minutes on two CPU cores.",
+)
+
+
+def _dvgo_optimizers(coarse: int, fine: int, grids: float = 0.1, decay: float = 0.1 ** (1 / 20_000)) -> dict[str, Any]:
+    """Adam for steps of DVGO's two stages, each with its own exponential decay by ``decay`` a step.
+
+    The fine stage's rates wait through the coarse stage, in which nothing of it is trained. eps is far below the
+    gradients of voxels at their first alpha of 1e-6, or those would not move.
+    """
+
+    def group(lr: float, begin: int, end: int) -> dict[str, Any]:
+        schedule = ExponentialDecaySchedulerConfig(
+            lr_pre_warmup=lr, warmup_steps=begin, max_steps=end, lr_final=lr * decay ** (end - begin)
+        )
+        return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": schedule}
+
+    return {
+        "coarse": group(grids, 0, coarse),
+        "fine": group(grids, coarse, coarse + fine),
+        "mlp": group(1e-3, coarse, coarse + fine),
+    }
+
+
+def _dvgo(name: str, dataparser: DataParserConfig, description: str) -> MethodSpecification:
+    """DVGO as in its paper, for as long as KRONC's trains it (section 5.1): 5k coarse and 10k fine steps of 8192 rays."""
+    return MethodSpecification(
+        config=TrainerConfig(
+            method_name=name,
+            steps_per_eval_batch=500,
+            steps_per_eval_image=2500,
+            steps_per_eval_all_images=15_000,
+            steps_per_save=2500,
+            max_num_iterations=15_000,
+            mixed_precision=False,
+            pipeline=VanillaPipelineConfig(
+                datamanager=VanillaDataManagerConfig(
+                    dataparser=dataparser,
+                    train_num_rays_per_batch=8192,
+                    eval_num_rays_per_batch=8192,
+                ),
+                model=DVGOModelConfig(eval_num_rays_per_chunk=8192),
+            ),
+            optimizers=_dvgo_optimizers(5000, 10_000),
+            viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+            vis="viewer",
+        ),
+        description=description,
+    )
+
+
+dvgo = _dvgo("dvgo", NerfstudioDataParserConfig(), "Direct Voxel Grid Optimization (CVPR 2022), pure torch.")
+kronc_dvgo = _dvgo("kronc-dvgo", KroncDataParserConfig(), "DVGO on KRONC poses, with the paper's settings.")
+
+kronc_dvgo_cpu = MethodSpecification(
+    # Sized for two CPU cores and images of about 200 px: small grids, fewer rays and steps with a faster decay, a
+    # smaller network, no viewer.
+    config=TrainerConfig(
+        method_name="kronc-dvgo-cpu",
+        steps_per_eval_batch=0,
+        steps_per_eval_image=0,
+        steps_per_eval_all_images=0,
+        steps_per_save=400,
+        max_num_iterations=1600,
+        mixed_precision=False,
+        pipeline=VanillaPipelineConfig(
+            datamanager=VanillaDataManagerConfig(
+                dataparser=KroncDataParserConfig(),
+                train_num_rays_per_batch=1024,
+                eval_num_rays_per_batch=1024,
+            ),
+            model=DVGOModelConfig(
+                coarse_iterations=400,
+                coarse_voxels=40**3,
+                fine_voxels=80**3,
+                growth_steps=(200, 400, 600),
+                mlp_width=64,
+                eval_num_rays_per_chunk=4096,
+            ),
+        ),
+        optimizers=_dvgo_optimizers(400, 1200, decay=0.1 ** (1 / 1200)),
+        viewer=ViewerConfig(quit_on_train_completion=True),
+        machine=MachineConfig(device_type="cpu"),
+        vis="tensorboard",
+    ),
+    description="DVGO on KRONC poses, sized to train in a few minutes on two CPU cores.",
 )

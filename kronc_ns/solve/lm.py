@@ -90,20 +90,31 @@ def adjust(
     start: State,
     config: LmConfig | None = None,
     progress: Callable[[int, float], None] | None = None,
+    most_sigma_px: Float[Tensor, "b"] | None = None,
 ) -> LmResult:
-    """Minimise from ``start``; scenes that converge leave the batch. ``progress(step, loss)`` is optional."""
+    """Minimise from ``start``; scenes that converge leave the batch. ``progress(step, loss)`` is optional.
+
+    ``most_sigma_px`` is for a start that is nearly right among many outliers: noise that residuals far above it do
+    not make believe otherwise.
+    """
     config = config or LmConfig()
     with torch.no_grad():
-        return _adjust(problem, start, config, progress)
+        return _adjust(problem, start, config, progress, most_sigma_px)
 
 
 def _adjust(
-    problem: Problem, start: State, config: LmConfig, progress: Callable[[int, float], None] | None
+    problem: Problem,
+    start: State,
+    config: LmConfig,
+    progress: Callable[[int, float], None] | None,
+    most_sigma_px: Float[Tensor, "b"] | None,
 ) -> LmResult:
     whole, scenes = problem, len(problem.uv)
     counts = _redundancy(problem)
     residual = residuals(problem, start)
     sigma = _robust_sigma(problem, residual) * counts
+    if most_sigma_px is not None:
+        sigma = torch.minimum(sigma, most_sigma_px)
     search = _Search(
         scene=torch.arange(scenes, device=problem.uv.device),
         state=start,

@@ -10,11 +10,13 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from kronc_ns.geometry.poses import look_at
+from kronc_ns.geometry.poses import invert, look_at, make_pose
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.solve.bundle import Problem, State, residuals
 from kronc_ns.solve.lm import LmConfig, adjust
@@ -23,6 +25,7 @@ _AZIMUTHS = 24
 _ELEVATIONS_DEG = (-5.0, 15.0, 35.0, 60.0)
 _ROLLS_DEG = (0.0, 90.0, 180.0, 270.0)
 _REFINED = 4
+_SAMPLES = 1000
 AWAY = -0.25
 """A point whose normal makes a larger angle with its ray (cosine below this) cannot be seen."""
 
@@ -43,39 +46,101 @@ def locate(
     focal: Float[Tensor, "m 2"],
     tolerance_px: Float[Tensor, "m"],
     normals: Float[Tensor, "j 3"] | None = None,
+    exact: bool = False,
 ) -> Located:
     """Pose of each of M views of known points (z up for a sensible start; NaN where unknown).
 
     ``uv`` are pixels less the principal point. ``tolerance_px`` is what a good detection may be off, the points'
-    own uncertainty included. At least four known points should be seen.
+    own uncertainty included. At least four known points should be seen. Where the points are ``exact`` (solved, not
+    guessed), consensus of small samples is tried, too: it stands more outliers.
     """
     weight = torch.where(points.isfinite().all(-1), weight, 0.0)
     points = points.nan_to_num(0.0)
-    rotation, translation = _best_guesses(points, uv / focal[..., None], weight)
-    views, guesses = rotation.shape[:2]
+    plane = uv / focal[..., None]
+    w2c = _refined(_best_guesses(points, plane, weight), points, uv, weight, focal, None)
+    if exact:
+        sampled = _consensus(points, plane, weight, tolerance_px / focal[:, 0])
+        w2c = torch.cat([w2c, sampled[:, None]], dim=1)
+        w2c = _refined(w2c, points, uv, weight, focal, tolerance_px / 3)
+    views, guesses = w2c.shape[:2]
 
     def each(x: Tensor) -> Tensor:
         return x.repeat_interleave(guesses, dim=0)
 
     problem = Problem(each(uv)[:, None], each(weight)[:, None], each(focal), points_known=True)
-    start = State(
-        rotation.flatten(0, 1)[:, None],
-        translation.flatten(0, 1)[:, None],
-        each(points),
-        uv.new_zeros(views * guesses, 0),
-    )
-    found = adjust(problem, start, LmConfig(iterations=15, tolerance=1e-3)).state
-    norm = residuals(problem, found).norm[:, 0]
-    c2w = found.c2w[:, 0]
-    off = 1 - 1 / (1 + (norm / each(tolerance_px)[:, None]).square())
-    if normals is not None:
-        ray = torch.nn.functional.normalize(c2w[:, None, :, 3] - each(points), dim=-1)
-        off = torch.where((ray * normals).sum(-1) < AWAY, 1.0, off)
-    counted = each(weight)
-    cost = ((off * counted).sum(-1) / counted.sum(-1).clamp_min(1e-9)).view(views, guesses)
+    state = State.of(invert(w2c.flatten(0, 1))[:, None], each(points))
+    norm = residuals(problem, state).norm[:, 0]
+    cost = unexplained(norm, each(weight), state.c2w[:, 0], each(points), each(tolerance_px), normals)
+    cost = cost.view(views, guesses)
     best = cost.nan_to_num(math.inf).argmin(dim=1)
-    w2c = torch.cat([found.rotation[:, 0], found.translation[:, 0, :, None]], dim=-1).view(views, guesses, 3, 4)
     return Located(w2c[torch.arange(views), best], cost[torch.arange(views), best])
+
+
+def _refined(
+    w2c: Float[Tensor, "m g 3 4"],
+    points: Float[Tensor, "m j 3"],
+    uv: Float[Tensor, "m 2 j"],
+    weight: Float[Tensor, "m j"],
+    focal: Float[Tensor, "m 2"],
+    sigma_px: Float[Tensor, "m"] | None,
+) -> Float[Tensor, "m g 3 4"]:
+    """Every guess after robust least squares, with a known noise or else one that follows the residuals down."""
+    views, guesses = w2c.shape[:2]
+    problem, start = (
+        Problem(
+            uv.repeat_interleave(guesses, dim=0)[:, None],
+            weight.repeat_interleave(guesses, dim=0)[:, None],
+            focal.repeat_interleave(guesses, dim=0),
+            points_known=True,
+        ),
+        State.of(invert(w2c.flatten(0, 1))[:, None], points.repeat_interleave(guesses, dim=0)),
+    )
+    most = None if sigma_px is None else sigma_px.repeat_interleave(guesses, dim=0)
+    found = adjust(problem, start, LmConfig(iterations=15, tolerance=1e-3), most_sigma_px=most).state
+    return make_pose(found.rotation, found.translation)[:, 0].view(views, guesses, 3, 4)
+
+
+def unexplained(
+    error_px: Float[Tensor, "m j"],
+    weight: Float[Tensor, "m j"],
+    c2w: Float[Tensor, "m 3 4"],
+    points: Float[Tensor, "m j 3"],
+    tolerance_px: Float[Tensor, "m"],
+    normals: Float[Tensor, "j 3"] | None = None,
+) -> Float[Tensor, "m"]:
+    """Weighted mean over the detections of what a pose leaves unexplained: 0 where met, 1 where far off or away."""
+    off = 1 - 1 / (1 + (error_px / tolerance_px[:, None]).square())
+    if normals is not None:
+        ray = torch.nn.functional.normalize(c2w[:, None, :, 3] - points, dim=-1)
+        off = torch.where((ray * normals).sum(-1) < AWAY, 1.0, off)
+    return (torch.where(weight > 0, off, 0.0) * weight).sum(-1) / weight.sum(-1).clamp_min(1e-9)
+
+
+def _consensus(
+    points: Float[Tensor, "m j 3"],
+    plane: Float[Tensor, "m 2 j"],
+    weight: Float[Tensor, "m j"],
+    tolerance: Float[Tensor, "m"],
+) -> Float[Tensor, "m 3 4"]:
+    """Pose (w2c) of each view by OpenCV's RANSAC over SQPnP; the identity, far off, where it finds none.
+
+    For the few views that nothing else could place: OpenCV takes one view at a time.
+    """
+    found = torch.eye(3, 4, dtype=points.dtype).repeat(len(points), 1, 1)
+    cv2.setRNGSeed(0)
+    for i, seen in enumerate((weight > 0).cpu()):
+        ok, turn, shift, _ = cv2.solvePnPRansac(
+            points[i, seen].cpu().numpy(),
+            plane[i, :, seen].T.contiguous().cpu().numpy(),
+            np.eye(3),
+            None,
+            iterationsCount=_SAMPLES,
+            reprojectionError=float(tolerance[i]),
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+        if ok:
+            found[i] = torch.from_numpy(np.hstack([cv2.Rodrigues(turn)[0], shift]))
+    return found.to(points)
 
 
 @lru_cache(maxsize=4)
@@ -94,8 +159,8 @@ def _directions() -> Float[Tensor, "h 3 3"]:
 
 def _best_guesses(
     points: Float[Tensor, "m j 3"], plane: Float[Tensor, "m 2 j"], weight: Float[Tensor, "m j"]
-) -> tuple[Float[Tensor, "m g 3 3"], Float[Tensor, "m g 3"]]:
-    """The most promising poses of each view by object-space error over distance, no two of them neighbours."""
+) -> Float[Tensor, "m g 3 4"]:
+    """The most promising poses (w2c) of each view by object-space error over distance, no two of them neighbours."""
     ray = torch.nn.functional.normalize(torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1), dim=1)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     across = (identity[:, :, None] - ray[:, :, None] * ray[:, None]) * weight[:, None, None]  # [m, 3, 3, j]
@@ -118,4 +183,4 @@ def _best_guesses(
     best = error.topk(_REFINED, dim=1, largest=False).indices
     rotation = directions[best]
     translation = torch.take_along_dim(translation, best[..., None], dim=1)
-    return rotation, translation - (rotation @ mean[:, None, 0, :, None])[..., 0]
+    return make_pose(rotation, translation - (rotation @ mean[:, None, 0, :, None])[..., 0])
