@@ -11,7 +11,12 @@ with jaxtyping.install_import_hook(
         "kronc_ns.geometry",
         "kronc_ns.objective",
         "kronc_ns.init",
-        "kronc_ns.solve",
+        "kronc_ns.solve.adam",  # each by itself: solve.bundle_cpu is compiled and cannot be checked
+        "kronc_ns.solve.bundle",
+        "kronc_ns.solve.lm",
+        "kronc_ns.solve.resection",
+        "kronc_ns.solve.solution",
+        "kronc_ns.solve.uncertainty",
         "kronc_ns.keypoints",
         "kronc_ns.frame",
         "kronc_ns.orbit",

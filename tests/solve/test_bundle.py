@@ -18,6 +18,7 @@ from kronc_ns.solve.bundle import (
     linearise,
     move,
     orbit_error,
+    reduce_system,
     residuals,
     solve_step,
 )
@@ -78,12 +79,22 @@ def step_of(flat: Tensor, unknown: int) -> Step:
     return Step(cameras, points.view(1, 3, JOINTS).mT, flat[6 * VIEWS + 3 * JOINTS :].view(1, unknown))
 
 
+def reprojection(problem: Problem, state: State) -> Tensor:
+    """Projection minus detection in pixels by the book, [b, n, 2, j]."""
+    camera = state.rotation @ state.points.mT[:, None] + state.translation[..., None]
+    plane = camera[:, :, :2] / camera[:, :, 2:]
+    unknown = dict(zip(problem.refine, state.intrinsics.unbind(1), strict=True))
+    zero = torch.zeros(len(plane), dtype=torch.float64)
+    bent = plane * (1 + unknown.get("k1", zero)[:, None, None, None] * plane.square().sum(2, keepdim=True))
+    return bent * (problem.focal * unknown.get("focal", zero).exp()[:, None])[:, None, :, None] - problem.uv
+
+
 def weighted_residuals(problem: Problem, state: State, weight: Tensor):
     """All residuals of a step from ``state``, such that half their squares' sum is what the step shall lower."""
 
     def function(flat: Tensor) -> Tensor:
         trial = move(state, step_of(flat, len(problem.refine)))
-        rows = [((weight * problem.weight).sqrt()[:, :, None] * residuals(problem, trial).error).flatten()]
+        rows = [((weight * problem.weight).sqrt()[:, :, None] * reprojection(problem, trial)).flatten()]
         if problem.shape is not None:
             root = torch.linalg.cholesky(problem.shape.precision).T
             deviation = trial.points.mT.flatten() - problem.shape.mean
@@ -148,6 +159,33 @@ def test_eliminating_the_cameras_gives_the_step_of_the_whole_system(variant, dam
         torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_errors_are_projections_less_detections_where_something_is_seen(variant):
+    problem, state, _ = posed(variant, batch=2)
+    if "k1" in problem.refine:
+        state.intrinsics[:, problem.refine.index("k1")] = -0.07
+    found, seen = residuals(problem, state), problem.weight > 0
+    expected = torch.where(seen[:, :, None], reprojection(problem, state), 0.0)
+    torch.testing.assert_close(found.error, expected, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(found.norm, (expected.square().sum(2) * problem.weight).sqrt(), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_short_cut_to_the_reduced_system_is_no_other_system(variant):
+    """Compiled for the CPU where that serves: what it leaves out are zeros."""
+    problem, state, weight, _ = systems(variant, batch=3)
+    problem.weight[0, 2], problem.weight[1, :, 4] = 0, 0
+    damping = torch.tensor([1e-3, 1.0, 10.0], dtype=torch.float64)
+    ones, residual = torch.ones(3, dtype=torch.float64), residuals(problem, state)
+    arguments = (problem, state, residual, weight, VARIANCE * ones, SHAPE_WEIGHT * ones)
+    short, long = reduce_system(*arguments, damping), eliminate_cameras(linearise(*arguments), damping)
+    for ours, theirs in zip(vars(short).values(), vars(long).values(), strict=True):
+        ours, theirs = (x.tril() if x is short.matrix or x is long.matrix else x for x in (ours, theirs))
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-7)
+    for ours, theirs in zip(*(vars(solve_step(x, JOINTS)).values() for x in (short, long)), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-7, atol=1e-10)
+
+
 def test_a_damped_step_lowers_the_cost():
     problem, state, weight, system = systems("everything")
     function = weighted_residuals(problem, state, weight)
@@ -193,7 +231,7 @@ def test_a_shape_prior_leaves_no_gauge():
 
 @pytest.mark.parametrize("variant", ["plain", "everything"])
 def test_a_batch_is_its_scenes_one_by_one(variant):
-    problem, state, weight, system = systems(variant, batch=3)
+    problem, state, weight, _ = systems(variant, batch=3)
     damping = torch.tensor([1e-3, 1.0, 10.0], dtype=torch.float64)
     together = solve_step(eliminate_cameras(system, damping), JOINTS)
     for i in range(3):
