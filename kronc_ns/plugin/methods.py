@@ -126,7 +126,7 @@ def _dvgo_optimizers(coarse: int, fine: int, grids: float = 0.1, decay: float = 
 
 
 def _dvgo(name: str, dataparser: DataParserConfig, description: str) -> MethodSpecification:
-    """DVGO as in its paper, for as long as KRONC's trains it (section 5.1): 5k coarse and 10k fine steps of 8192 rays."""
+    """DVGO as in its paper, for as long as in KRONC's (section 5.1): 5k coarse and 10k fine steps of 8192 rays."""
     return MethodSpecification(
         config=TrainerConfig(
             method_name=name,
