@@ -1,4 +1,4 @@
-"""Scenes to the second-order solver and back: where it may start, what it makes of a start, repair of odd views.
+"""Scenes to the second-order solver and back.
 
 Scenes that are handed in together are solved in batches; what happens to one does not depend on the others.
 """
@@ -14,47 +14,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from kronc_ns import objective
-from kronc_ns.frame import rough_frame
-from kronc_ns.geometry.camera import rays
-from kronc_ns.geometry.poses import invert
-from kronc_ns.init import Direction, circular_poses, triangulate
 from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.options import KroncConfig
-from kronc_ns.scene import Scene
 from kronc_ns.solve.bundle import Problem, ShapePrior, State
 from kronc_ns.solve.lm import LmResult, adjust
-from kronc_ns.solve.resection import AWAY, locate, unexplained
 from kronc_ns.solve.uncertainty import camera_covariance
+from kronc_ns.starts import MIN_POINTS, Start, far_side, in_front, usable_views
 
-MIN_POINTS = 4
-"""A view with fewer keypoints cannot be placed by them alone (three points have up to four poses)."""
 _NO_CHANCE = 8  # a pose can be bent to meet three detections; eight do not agree by accident
-_ALL_LAPS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
-_TEMPLATE_TOLERANCE = 0.03  # of the car's extent in the image: about 13 cm on the car
-_TOLERANCE_SIGMAS = 3.0  # likewise, once the points are solved
-_LOST = 0.8  # mean robust cost of a view's detections from which on its pose says nothing
-_SWAP_GAIN = 0.7  # a view is taken for left-right swapped where that lowers its cost below this share
-_ODD_SHARE = 0.3  # share of a view's detections on the far side of the car that makes the view suspect
-_REPAIRS = 3
 _PADDING = 8  # views are padded to a multiple, so that scenes of similar size share a batch
 _BATCH_VIEWS = 400  # views in a batch: what stays in the processor's cache
 _REFINEMENTS = 4  # rounds of undistortion with the k1 found
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where the solver may start."""
-
-    name: str
-    scene: Scene
-    """Keypoints with left and right put right, as far as that is known."""
-    c2w: Float[Tensor, "n 3 4"]
-    points: Float[Tensor, "j 3"]
-    used: Bool[Tensor, "n"]
-    """Views that take part."""
-    swapped: Bool[Tensor, "n"]
-    """Views whose detections had left and right confused."""
 
 
 @dataclass(frozen=True)
@@ -92,63 +63,6 @@ def shape_prior(schema: KeypointSchema) -> ShapePrior | None:
     """The template as a prior of the solver, where the schema has one."""
     template = car_template(schema)
     return None if template is None else ShapePrior.of(template.mean, template.precision())
-
-
-def usable_views(scene: Scene) -> Bool[Tensor, "n"]:
-    """Views with enough keypoints to be solved."""
-    return scene.visibility.sum(1) >= MIN_POINTS
-
-
-def start_from_poses(name: str, scene: Scene, c2w: Float[Tensor, "n 3 4"]) -> Start:
-    """Start at given poses; carried into the car's frame where there is a template."""
-    used = usable_views(scene)
-    m = scene.visibility * used[:, None]
-    points = triangulate(c2w, rays(scene.uv, scene.camera), m)
-    template = car_template(scene.schema)
-    if template is not None:
-        known = m.sum(0) >= 2
-        frame = rough_frame(torch.where(known[:, None], points, math.nan), template)
-        c2w = frame.apply_to_poses(c2w)
-        points = torch.where(known[:, None], frame.apply(points), template.mean)
-    return Start(name, scene, c2w, points, used, torch.zeros_like(used))
-
-
-def start_from_template(scene: Scene) -> Start:
-    """Start at the template's pose in each view by itself; left and right are put right where that fits better."""
-    template = car_template(scene.schema)
-    assert template is not None
-    used = usable_views(scene)
-    c2w, cost, swapped = _locate(scene, template.mean, used, None)
-    keypoints = torch.where(swapped[:, None, None], mirrored(scene.keypoints, scene.schema), scene.keypoints)
-    return Start(
-        "template",
-        replace(scene, keypoints=keypoints),
-        c2w,
-        template.mean.clone(),
-        used & (cost < _LOST),
-        swapped,
-    )
-
-
-def circles(scene: Scene, config: KroncConfig) -> list[Start]:
-    """Starts at level circles: as the options say and, with ``init="auto"``, both ways and other shares of a lap."""
-    kinds: list[tuple[Direction, float]] = [(config.direction, config.laps)]
-    if config.init == "auto":
-        ways: tuple[Direction, ...] = ("ccw", "cw")
-        kinds += [(way, laps) for laps in _ALL_LAPS for way in ways if (way, laps) != kinds[0]]
-    return [
-        start_from_poses(
-            "circular" if config.init == "circular" else f"circular ({way}, {laps:g} lap{'s' if laps > 1 else ''})",
-            scene,
-            circular_poses(len(scene), config.radius_m, way, laps),
-        )
-        for way, laps in kinds
-    ]
-
-
-def mirrored(keypoints: Float[Tensor, "n j 3"], schema: KeypointSchema) -> Float[Tensor, "n j 3"]:
-    """Detections with left and right exchanged."""
-    return keypoints[:, torch.tensor(schema.flip)]
 
 
 def adjust_starts(
@@ -273,125 +187,3 @@ def misfit(attempt: Attempt) -> float:
     off = (1 - 1 / (1 + (error / tolerance).square())).nan_to_num(1.0)
     lost = ~in_front(start) | far_side(start) | ~start.used[:, None]
     return float(torch.where(lost, 1.0, off)[counted].mean())
-
-
-def in_front(start: Start) -> Bool[Tensor, "n j"]:
-    """Whether each point lies before each camera."""
-    return ((start.points - start.c2w[:, None, :, 3]) * start.c2w[:, None, :, 2]).sum(-1) > 0
-
-
-def far_side(start: Start) -> Bool[Tensor, "n j"]:
-    """Whether each point looks away from each camera; never, where the schema has no template."""
-    template = car_template(start.scene.schema)
-    if template is None:
-        return torch.zeros(len(start.scene), len(start.scene.schema), dtype=torch.bool)
-    ray = torch.nn.functional.normalize(start.c2w[:, None, :, 3] - start.points, dim=-1)
-    return (ray * template.normals).sum(-1) < AWAY
-
-
-def repair(attempts: Sequence[Attempt], config: KroncConfig) -> list[Attempt]:
-    """Find views that disagree or look through the car, locate them anew (also left-right swapped), solve again."""
-    attempts = list(attempts)
-    suspects: list[Bool[Tensor, "n"]] = [torch.empty(0, dtype=torch.bool)] * len(attempts)
-    active = list(range(len(attempts)))
-    for _ in range(_REPAIRS):
-        changed: list[int] = []
-        for i in active:
-            suspect = _suspects(attempts[i])
-            if suspect.any() and not torch.equal(suspect, suspects[i]):
-                suspects[i] = suspect
-                attempts[i] = replace(attempts[i], start=_relocated(attempts[i], suspect))
-                changed.append(i)
-        if not changed:
-            break
-        solved = adjust_starts([attempts[i].start for i in changed], config)
-        for i, attempt in zip(changed, solved, strict=True):
-            attempts[i] = replace(
-                attempt,
-                initial_c2w=attempts[i].initial_c2w,
-                iterations=attempts[i].iterations + attempt.iterations,
-                history=attempts[i].history,
-            )
-        active = changed
-    return attempts
-
-
-def _suspects(attempt: Attempt) -> Bool[Tensor, "n"]:
-    start = attempt.start
-    seen = start.scene.visibility > 0
-    away = (far_side(start) & seen).sum(1) > _ODD_SHARE * seen.sum(1)
-    few = 2 * attempt.inlier.sum(1) < seen.sum(1)
-    return usable_views(start.scene) & (~attempt.agreeing | few | away)
-
-
-def _relocated(attempt: Attempt, suspect: Bool[Tensor, "n"]) -> Start:
-    """The start with suspect views where they fit the solved points best, or left out."""
-    start = attempt.start
-    scene = start.scene
-    trusted = (attempt.inlier & ~suspect[:, None]).sum(0) >= 2
-    points = torch.where(trusted[:, None], start.points, math.nan)
-    c2w, cost, swapped = _locate(scene, points, suspect, attempt.sigma_px)
-    better = suspect & (cost < _present_cost(start, points, attempt.sigma_px))
-    swapped &= better
-    keypoints = torch.where(swapped[:, None, None], mirrored(scene.keypoints, scene.schema), scene.keypoints)
-    return replace(
-        start,
-        scene=replace(scene, keypoints=keypoints),
-        c2w=torch.where(better[:, None, None], c2w, start.c2w),
-        used=torch.where(better, cost < _LOST, start.used & (attempt.agreeing | ~suspect)),
-        swapped=start.swapped ^ swapped,
-    )
-
-
-def _present_cost(start: Start, points: Float[Tensor, "j 3"], sigma_px: float) -> Float[Tensor, "n"]:
-    """Cost of every view where it is, as `locate` reckons it; inf where it has no pose."""
-    scene, template = start.scene, car_template(start.scene.schema)
-    error = (objective.reproject(points, start.c2w, scene.camera) - scene.uv).norm(dim=-1)
-    cost = unexplained(
-        torch.where(in_front(start), error, math.inf),
-        torch.where(points.isfinite().all(-1), scene.visibility, 0.0),
-        start.c2w,
-        points.expand(len(scene), -1, -1),
-        torch.full((len(scene),), _TOLERANCE_SIGMAS * sigma_px, dtype=torch.float64),
-        None if template is None else template.normals,
-    )
-    return torch.where(start.used, cost.nan_to_num(math.inf), math.inf)
-
-
-def _locate(
-    scene: Scene, points: Float[Tensor, "j 3"], chosen: Bool[Tensor, "n"], sigma_px: float | None
-) -> tuple[Float[Tensor, "n 3 4"], Float[Tensor, "n"], Bool[Tensor, "n"]]:
-    """Pose, cost and whether left and right are swapped, of the chosen views by themselves (others: NaN, inf, no)."""
-    template, camera = car_template(scene.schema), scene.camera
-    index = chosen.nonzero()[:, 0]
-    has_sides = any(j != f for j, f in enumerate(scene.schema.flip))
-    variants = [scene.keypoints[index]]
-    if has_sides:
-        variants.append(mirrored(scene.keypoints[index], scene.schema))
-    detected = torch.cat(variants)
-    m = detected[..., 2] > 0
-    uv = camera.undistort(detected[..., :2]) - torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
-    if sigma_px is None:
-        spread = torch.where(m[..., None], uv, -math.inf).amax(1) - torch.where(m[..., None], uv, math.inf).amin(1)
-        tolerance = _TEMPLATE_TOLERANCE * spread.amax(1)
-    else:
-        tolerance = torch.full((len(detected),), _TOLERANCE_SIGMAS * sigma_px, dtype=torch.float64)
-    focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
-    found = locate(
-        points.expand(len(detected), -1, -1),
-        uv.transpose(1, 2).contiguous(),
-        m.to(torch.float64),
-        focal.expand(len(detected), 2),
-        tolerance,
-        None if template is None else template.normals,
-        exact=sigma_px is not None,
-    )
-    poses, costs = invert(found.w2c).unflatten(0, (len(variants), -1)), found.cost.view(len(variants), -1)
-    flipped = costs[-1] < _SWAP_GAIN * costs[0]
-    c2w = torch.full((len(scene), 3, 4), math.nan, dtype=torch.float64)
-    cost = torch.full((len(scene),), math.inf, dtype=torch.float64)
-    swapped = torch.zeros(len(scene), dtype=torch.bool)
-    c2w[index] = torch.where(flipped[:, None, None], poses[-1], poses[0])
-    cost[index] = torch.where(flipped, costs[-1], costs[0])
-    swapped[index] = flipped
-    return c2w, cost, swapped

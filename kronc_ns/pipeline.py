@@ -16,29 +16,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import assert_never
 
-from kronc_ns.adjustment import (
-    Attempt,
-    Start,
-    adjust_starts,
-    circles,
-    measured,
-    misfit,
-    repair,
-    start_from_poses,
-    start_from_template,
-    usable_views,
-)
+from kronc_ns.adjustment import Attempt, adjust_starts, measured, misfit
+from kronc_ns.completion import complete
 from kronc_ns.errors import KroncError
 from kronc_ns.frame import standing, template_frame
 from kronc_ns.geometry.alignment import Similarity, umeyama
 from kronc_ns.init import circular_poses, prior_depths, random_depths
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.options import KroncConfig as KroncConfig
-from kronc_ns.orbit import interpolate_walk
+from kronc_ns.repair import repair
 from kronc_ns.scene import Scene
 from kronc_ns.solve.adam import AdamResult, minimise
-from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
+from kronc_ns.solve.solution import Solution, Status, ViewStatus
 from kronc_ns.solve.threads import one_thread
+from kronc_ns.starts import Start, circles, start_from_poses, start_from_template, usable_views
 from kronc_ns.verify import Evidence, verify
 
 _FORMAT = 2  # raised whenever the same input and options give another solution
@@ -304,7 +295,7 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig) -> Solution:
         rmse_px=rmse_px,
         median_px=median_px,
     )
-    return _completed(solution) if config.min_status == "completed" and not solved.all() else solution
+    return complete(start.scene, solution) if config.min_status == "completed" and not solved.all() else solution
 
 
 def _placement(
@@ -333,33 +324,3 @@ def _placement(
     length = template.length_m(in_car_frame.apply(points)) * placement.scale / in_car_frame.scale
     growth = config.car_length_m / length
     return Similarity(growth * placement.scale, placement.rotation, growth * placement.translation)
-
-
-def _completed(solution: Solution) -> Solution:
-    """Views that were not solved, placed on the walk between their neighbours where there is one."""
-    known = torch.tensor([view.status is ViewStatus.SOLVED for view in solution.views])
-    if not known.any():
-        return solution
-    # the walk goes around the z axis through the car
-    middle = solution.points.nanmean(0)
-    centred = solution.c2w.clone()
-    centred[..., 3] -= middle
-    walk = interpolate_walk(centred, known)
-    if walk is None:
-        return solution
-    placed = ~known & walk.c2w.isfinite().all(-1).all(-1)
-    views: list[ViewReport] = [
-        replace(
-            view,
-            status=ViewStatus.COMPLETED,
-            reason=f"placed between its neighbours: {view.reason}",
-            sigma_rot_deg=float(walk.sigma_rot_deg[i]),
-            sigma_trans_m=float(walk.sigma_trans_m[i]),
-        )
-        if placed[i]
-        else view
-        for i, view in enumerate(solution.views)
-    ]
-    c2w = walk.c2w.clone()
-    c2w[..., 3] += middle
-    return replace(solution, c2w=torch.where(placed[:, None, None], c2w, solution.c2w), views=tuple(views))

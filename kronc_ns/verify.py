@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from kronc_ns import objective
-from kronc_ns.adjustment import MIN_POINTS, agrees
+from kronc_ns.adjustment import agrees
 from kronc_ns.scene import Scene
 from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
+from kronc_ns.starts import MIN_POINTS
 
 MIN_VIEWS = 3
 INLIER_SIGMAS = 5.0

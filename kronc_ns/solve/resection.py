@@ -122,7 +122,7 @@ def _consensus(
     weight: Float[Tensor, "m j"],
     tolerance: Float[Tensor, "m"],
 ) -> Float[Tensor, "m 3 4"]:
-    """Pose (w2c) of each view by OpenCV's RANSAC over SQPnP; the identity, far off, where it finds none.
+    """Pose (w2c) of each view by OpenCV's RANSAC over three-point poses; the identity, far off, where it finds none.
 
     For the few views that nothing else could place: OpenCV takes one view at a time.
     """
@@ -136,7 +136,7 @@ def _consensus(
             None,
             iterationsCount=_SAMPLES,
             reprojectionError=float(tolerance[i]),
-            flags=cv2.SOLVEPNP_SQPNP,
+            flags=cv2.SOLVEPNP_AP3P,
         )
         if ok:
             found[i] = torch.from_numpy(np.hstack([cv2.Rodrigues(turn)[0], shift]))
