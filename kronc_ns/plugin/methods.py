@@ -5,6 +5,7 @@ from typing import Any
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -17,6 +18,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from kronc_ns.plugin.compatibility import allow_numpy_in_checkpoints, train_without_lpips_weights
 from kronc_ns.plugin.dataparser import KroncDataParserConfig
 from kronc_ns.plugin.dvgo.model import DVGOModelConfig
+from kronc_ns.plugin.splat_cpu.model import SplatfactoCpuModelConfig
 
 allow_numpy_in_checkpoints()
 train_without_lpips_weights()
@@ -187,4 +189,81 @@ kronc_dvgo_cpu = MethodSpecification(
         vis="tensorboard",
     ),
     description="DVGO on KRONC poses, sized to train in a few minutes on two CPU cores.",
+)
+
+
+def _splat_optimizers(steps: int, faster: float = 1.0) -> dict[str, Any]:
+    """Splatfacto's optimizers for a training of ``steps``, with all rates ``faster`` times nerfstudio's."""
+
+    def group(lr: float, lr_final: float | None = None, warmup: int = 0) -> dict[str, Any]:
+        schedule = None
+        if lr_final is not None:
+            schedule = ExponentialDecaySchedulerConfig(
+                lr_final=faster * lr_final, max_steps=steps, warmup_steps=warmup, lr_pre_warmup=0 if warmup else 1e-8
+            )
+        return {"optimizer": AdamOptimizerConfig(lr=faster * lr, eps=1e-15), "scheduler": schedule}
+
+    return {
+        "means": group(1.6e-4, 1.6e-6),
+        "features_dc": group(0.0025),
+        "features_rest": group(0.0025 / 20),
+        "opacities": group(0.05),
+        "scales": group(0.005),
+        "quats": group(0.001),
+        "camera_opt": group(1e-4, 5e-7, warmup=1000),
+        "bilateral_grid": group(2e-3, 1e-4, warmup=1000),
+    }
+
+
+kronc_splatfacto = MethodSpecification(
+    # nerfstudio's splatfacto, but for the background: `kronc-dataparser` cuts the vehicle out on white by default,
+    # and a random background would have to be covered with white Gaussians.
+    config=TrainerConfig(
+        method_name="kronc-splatfacto",
+        steps_per_eval_image=100,
+        steps_per_eval_batch=0,
+        steps_per_save=2000,
+        steps_per_eval_all_images=1000,
+        max_num_iterations=30_000,
+        mixed_precision=False,
+        pipeline=VanillaPipelineConfig(
+            datamanager=FullImageDatamanagerConfig(dataparser=KroncDataParserConfig(), cache_images_type="uint8"),
+            model=SplatfactoCpuModelConfig(background_color="white"),
+        ),
+        optimizers=_splat_optimizers(30_000),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="viewer",
+    ),
+    description="Splatfacto on KRONC poses (gsplat's kernels, CUDA).",
+)
+
+kronc_splatfacto_cpu = MethodSpecification(
+    # Sized for two CPU cores and images of about 200 px: a tenth of the steps, so larger rates and a denser schedule,
+    # half size for the first third, fewer Gaussians, no resets of the opacities, no viewer.
+    config=TrainerConfig(
+        method_name="kronc-splatfacto-cpu",
+        steps_per_eval_image=0,
+        steps_per_eval_batch=0,
+        steps_per_save=1000,
+        steps_per_eval_all_images=0,
+        max_num_iterations=3000,
+        mixed_precision=False,
+        pipeline=VanillaPipelineConfig(
+            datamanager=FullImageDatamanagerConfig(dataparser=KroncDataParserConfig(), cache_images_type="uint8"),
+            model=SplatfactoCpuModelConfig(
+                background_color="white",
+                warmup_length=300,
+                num_downscales=1,
+                resolution_schedule=1000,
+                sh_degree_interval=500,
+                stop_split_at=2000,
+                stop_screen_size_at=0,
+            ),
+        ),
+        optimizers=_splat_optimizers(3000, faster=4.0),
+        viewer=ViewerConfig(quit_on_train_completion=True),
+        machine=MachineConfig(device_type="cpu"),
+        vis="tensorboard",
+    ),
+    description="Splatfacto on KRONC poses without CUDA, sized to train in a few minutes on two CPU cores.",
 )

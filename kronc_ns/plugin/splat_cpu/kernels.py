@@ -1,0 +1,308 @@
+"""Compiled loops of the rasteriser; importing this module imports numba, so import it only to rasterise.
+
+"3D Gaussian Splatting for Real-Time Radiance Field Rendering" (Kerbl et al. 2023), section 6 and appendix C, ordered
+for a CPU: within a tile the Gaussians come one after the other, front to back, and each works on whole rows of the
+tile at once. A pixel meets the same Gaussians in the same order as on a GPU. The loops over x have a fixed length and
+no branches, so that they compile to vector instructions; for that the constants are single precision, too.
+
+Arrays are flat over cameras: M = cameras x Gaussians, K = (tile, Gaussian) pairs, T = cameras x tiles.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+
+from kronc_ns.plugin.splat_cpu.tiles import TILE
+
+ALPHA_MIN = np.float32(1 / 255)  # fainter contributions are skipped
+ALPHA_MAX = np.float32(0.999)
+TRANSMITTANCE_MIN = np.float32(1e-4)  # a pixel is closed before its transmittance would fall below this
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+# The planes of a tile's workspace [planes, TILE, TILE]; one array for all, or the compiler fears that they overlap and
+# gives up on vector instructions. Colours or their gradients, one plane a channel, come after the others.
+PASSED, OPEN, WEIGHT, COLUMN, BEHIND, ALONG, PLANES = range(7)
+RECOUNT = 16  # Gaussians between two looks at which rows of a tile still have open pixels
+
+# exp(-s) = (e^-r e^-(s/8 - r))^8 with |s/8 - r| <= r on [0, REACH]: a Taylor series of degree 7 is exact to rounding
+REACH = np.float32(5.6)  # past log(255) even an opaque Gaussian is fainter than ALPHA_MIN
+EIGHTH, MIDDLE = np.float32(1 / 8), np.float32(5.6 / 16)
+C0, C1, C2, C3, C4, C5, C6, C7 = (np.float32((-1) ** n / math.factorial(n) * math.exp(-5.6 / 16)) for n in range(8))
+
+# Without nnan and ninf: a Gaussian that went astray may hold NaN, and comparisons with it must stay false.
+_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+
+
+def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """``numba.njit``, kept on disk where numba finds a folder it may write to, else compiled in every process."""
+
+    def compile_it(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            return numba.njit(cache=True, fastmath=_FASTMATH, error_model="numpy", **options)(function)
+        except RuntimeError:  # neither __pycache__ nor the user's cache nor NUMBA_CACHE_DIR can be written to
+            return numba.njit(fastmath=_FASTMATH, error_model="numpy", **options)(function)
+
+    return compile_it
+
+
+@_compiled()
+def _falloff(sigma: float) -> float:
+    """exp(-sigma) for sigma in [0, REACH], from products only: a call of ``exp`` would end the vector instructions."""
+    u = min(sigma, REACH) * EIGHTH - MIDDLE
+    e = C0 + u * (C1 + u * (C2 + u * (C3 + u * (C4 + u * (C5 + u * (C6 + u * C7))))))
+    e = e * e
+    e = e * e
+    return e * e
+
+
+@_compiled()
+def _rows(centre: float, a: float, b: float, c: float, opacity: float, low: int, high: int) -> tuple[int, int]:
+    """Rows within [low, high) that the ellipse ``alpha >= ALPHA_MIN`` reaches, at most one too many on either side."""
+    determinant = a * c - b * b
+    if not (determinant > 0 and a > 0):  # not an ellipse: rounding spoilt the covariance
+        return low, high
+    half = math.sqrt(2 * math.log(opacity / ALPHA_MIN) * a / determinant)
+    first = max(float(low), math.floor(centre - half - 0.5))
+    last = min(float(high), math.ceil(centre + half + 0.5))
+    return int(first), int(last)
+
+
+@_compiled()
+def _workspace(channels: int, height: int, width: int, dtype: Any) -> np.ndarray:
+    """Planes for a tile of which ``height`` x ``width`` pixels lie in the image."""
+    work = np.zeros((PLANES + channels, TILE, TILE), dtype)
+    for y in range(TILE):
+        for x in range(TILE):
+            work[PASSED, y, x] = ONE
+            work[OPEN, y, x] = ONE if (y < height) & (x < width) else ZERO
+            work[COLUMN, y, x] = x
+    return work
+
+
+@_compiled()
+def _any_open(work: np.ndarray, row_open: np.ndarray) -> bool:
+    """Whether a tile has open pixels left, and in ``row_open [TILE]`` which of its rows."""
+    anywhere = False
+    for y in range(TILE):
+        count = ZERO
+        for x in range(TILE):
+            count += work[OPEN, y, x]
+        row_open[y] = count > ZERO
+        anywhere |= row_open[y]
+    return anywhere
+
+
+@_compiled()
+def _composite_tile(
+    means2d: np.ndarray,
+    conics: np.ndarray,
+    colors: np.ndarray,
+    opacities: np.ndarray,
+    background: np.ndarray,
+    gaussians: np.ndarray,
+    top: int,
+    left: int,
+    render: np.ndarray,
+    transmittance: np.ndarray,
+) -> None:
+    """One tile of `rasterize_forward`: its own ``gaussians``, and the image of its own camera."""
+    kind = means2d.dtype.type
+    height, width, channels = render.shape
+    bottom, right = min(top + TILE, height), min(left + TILE, width)
+    work, row_open = _workspace(channels, bottom - top, right - left, means2d.dtype), np.ones(TILE, np.bool_)
+    for k in range(len(gaussians)):
+        if k % RECOUNT == 0 and not _any_open(work, row_open):
+            break
+        i = gaussians[k]
+        opacity = opacities[i]
+        if not opacity >= ALPHA_MIN:
+            continue
+        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+        first, last = _rows(means2d[i, 1], a, b, c, opacity, top, bottom)
+        start = means2d[i, 0] - kind(left + 0.5)
+        for y in range(first - top, last - top):
+            if not row_open[y]:
+                continue
+            dy = means2d[i, 1] - kind(y + top + 0.5)
+            slope, base = b * dy, HALF * c * dy * dy
+            for x in range(TILE):
+                dx = start - work[COLUMN, y, x]
+                sigma = (HALF * a * dx + slope) * dx + base
+                alpha = min(ALPHA_MAX, opacity * _falloff(sigma))
+                before = work[PASSED, y, x]
+                after = before * (ONE - alpha)
+                hit = (sigma >= ZERO) & (sigma < REACH) & (alpha >= ALPHA_MIN) & (work[OPEN, y, x] > ZERO)
+                drawn = hit & (after > TRANSMITTANCE_MIN)
+                work[WEIGHT, y, x] = alpha * before if drawn else ZERO
+                work[PASSED, y, x] = after if drawn else before
+                work[OPEN, y, x] = ZERO if hit & (not drawn) else work[OPEN, y, x]
+            for d in range(channels):
+                for x in range(TILE):
+                    work[PLANES + d, y, x] += work[WEIGHT, y, x] * colors[i, d]
+    for y in range(bottom - top):
+        for x in range(right - left):
+            transmittance[top + y, left + x] = work[PASSED, y, x]
+            for d in range(channels):
+                render[top + y, left + x, d] = work[PLANES + d, y, x] + work[PASSED, y, x] * background[d]
+
+
+@_compiled(parallel=True)
+def rasterize_forward(
+    means2d: np.ndarray,
+    conics: np.ndarray,
+    colors: np.ndarray,
+    opacities: np.ndarray,
+    backgrounds: np.ndarray,
+    gaussians: np.ndarray,
+    offsets: np.ndarray,
+    schedule: np.ndarray,
+    across: int,
+    render: np.ndarray,
+    transmittance: np.ndarray,
+) -> None:
+    """Composite front to back (equation 3 of the paper): C = sum_i c_i alpha_i T_i, T_i = prod_{j<i} (1 - alpha_j).
+
+    ``means2d [M,2]`` px, ``conics [M,3]`` (inverse 2D covariance: xx, xy, yy) 1/px^2, ``colors [M,D]``,
+    ``opacities [M]``, ``backgrounds [C,D]``, ``gaussians [K]`` front to back within each tile, ``offsets [T+1]`` into
+    it, ``schedule [T]`` the order of work; fills ``render [C,H,W,D]`` and ``transmittance [C,H,W]``.
+    """
+    tiles = (len(offsets) - 1) // len(render)
+    for turn in numba.prange(len(schedule)):
+        tile = schedule[turn]
+        camera, place = tile // tiles, tile % tiles
+        top, left = place // across * TILE, place % across * TILE
+        listed, image = gaussians[offsets[tile] : offsets[tile + 1]], (render[camera], transmittance[camera])
+        _composite_tile(means2d, conics, colors, opacities, backgrounds[camera], listed, top, left, *image)
+
+
+@_compiled()
+def _differentiate_tile(
+    means2d: np.ndarray,
+    conics: np.ndarray,
+    colors: np.ndarray,
+    opacities: np.ndarray,
+    gaussians: np.ndarray,
+    numbers: np.ndarray,
+    top: int,
+    left: int,
+    render: np.ndarray,
+    transmittance: np.ndarray,
+    v_render: np.ndarray,
+    v_alpha: np.ndarray,
+    v_pairs: np.ndarray,
+) -> None:
+    """One tile of `rasterize_backward`: its own ``gaussians`` and ``numbers``, and the image of its own camera."""
+    kind = means2d.dtype.type
+    height, width, channels = render.shape
+    bottom, right = min(top + TILE, height), min(left + TILE, width)
+    work, row_open = _workspace(channels, bottom - top, right - left, means2d.dtype), np.ones(TILE, np.bool_)
+    for y in range(bottom - top):
+        for x in range(right - left):  # behind: what the loss gains from here on
+            work[BEHIND, y, x] = -transmittance[top + y, left + x] * v_alpha[top + y, left + x]
+            for d in range(channels):
+                work[PLANES + d, y, x] = v_render[top + y, left + x, d]
+                work[BEHIND, y, x] += render[top + y, left + x, d] * work[PLANES + d, y, x]
+    for k in range(len(gaussians)):
+        if k % RECOUNT == 0 and not _any_open(work, row_open):
+            break
+        i, v = gaussians[k], numbers[k]
+        opacity = opacities[i]
+        if not opacity >= ALPHA_MIN:
+            continue
+        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+        first, last = _rows(means2d[i, 1], a, b, c, opacity, top, bottom)
+        start = means2d[i, 0] - kind(left + 0.5)
+        for y in range(first - top, last - top):
+            if not row_open[y]:
+                continue
+            dy = means2d[i, 1] - kind(y + top + 0.5)
+            slope, base = b * dy, HALF * c * dy * dy
+            for x in range(TILE):
+                work[ALONG, y, x] = ZERO
+            for d in range(channels):
+                for x in range(TILE):
+                    work[ALONG, y, x] += colors[i, d] * work[PLANES + d, y, x]
+            # sums over the row of v_sigma, v_sigma dx, v_sigma dx^2 and of the absolute gradients of the centre
+            sum_0, sum_1, sum_2, sum_x, sum_y = ZERO, ZERO, ZERO, ZERO, ZERO
+            for x in range(TILE):
+                dx = start - work[COLUMN, y, x]
+                sigma = (HALF * a * dx + slope) * dx + base
+                full = opacity * _falloff(sigma)
+                alpha = min(ALPHA_MAX, full)
+                before = work[PASSED, y, x]
+                after = before * (ONE - alpha)
+                hit = (sigma >= ZERO) & (sigma < REACH) & (alpha >= ALPHA_MIN) & (work[OPEN, y, x] > ZERO)
+                drawn = hit & (after > TRANSMITTANCE_MIN)
+                share = alpha * before if drawn else ZERO
+                rest = work[BEHIND, y, x] - share * work[ALONG, y, x]
+                v_sigma = alpha * (rest / (ONE - alpha) - before * work[ALONG, y, x])
+                v_sigma = v_sigma if drawn & (full <= ALPHA_MAX) else ZERO  # clamped: only the colour matters
+                work[WEIGHT, y, x] = share
+                work[BEHIND, y, x] = rest
+                work[PASSED, y, x] = after if drawn else before
+                work[OPEN, y, x] = ZERO if hit & (not drawn) else work[OPEN, y, x]
+                sum_0 += v_sigma
+                sum_1 += v_sigma * dx
+                sum_2 += v_sigma * dx * dx
+                sum_x += abs(v_sigma * (a * dx + slope))
+                sum_y += abs(v_sigma * (b * dx + c * dy))
+            v_pairs[v, 0] += a * sum_1 + slope * sum_0
+            v_pairs[v, 1] += b * sum_1 + c * dy * sum_0
+            v_pairs[v, 2] += sum_x
+            v_pairs[v, 3] += sum_y
+            v_pairs[v, 4] += HALF * sum_2
+            v_pairs[v, 5] += dy * sum_1
+            v_pairs[v, 6] += HALF * dy * dy * sum_0
+            v_pairs[v, 7] -= sum_0 / opacity
+            for d in range(channels):
+                total = ZERO
+                for x in range(TILE):
+                    total += work[WEIGHT, y, x] * work[PLANES + d, y, x]
+                v_pairs[v, 8 + d] += total
+
+
+@_compiled(parallel=True)
+def rasterize_backward(
+    means2d: np.ndarray,
+    conics: np.ndarray,
+    colors: np.ndarray,
+    opacities: np.ndarray,
+    gaussians: np.ndarray,
+    offsets: np.ndarray,
+    numbers: np.ndarray,
+    schedule: np.ndarray,
+    across: int,
+    render: np.ndarray,
+    transmittance: np.ndarray,
+    v_render: np.ndarray,
+    v_alpha: np.ndarray,
+    v_pairs: np.ndarray,
+) -> None:
+    """Gradients of every (tile, Gaussian) pair, walking front to back once more.
+
+    With g the gradient of a pixel's colour and R its rendered colour, background included,
+    dL/dalpha_i = T_i c_i.g - (what lies behind i) / (1 - alpha_i), and what lies behind is R.g minus what has been
+    passed, so no order needs to be turned round. ``v_render [C,H,W,D]`` and ``v_alpha [C,H,W]`` (of 1 - the final
+    transmittance) come in; row ``numbers[k]`` of ``v_pairs [K,8+D]`` is filled for pair k: means2d x, y and the sums
+    of their absolute values over pixels (AbsGS, Ye et al. 2024), conics xx, xy, yy, opacity, colours.
+    """
+    tiles = (len(offsets) - 1) // len(render)
+    for turn in numba.prange(len(schedule)):
+        tile = schedule[turn]
+        camera, place = tile // tiles, tile % tiles
+        top, left = place // across * TILE, place % across * TILE
+        start, end = offsets[tile], offsets[tile + 1]
+        listed, image = (gaussians[start:end], numbers[start:end]), (render[camera], transmittance[camera])
+        wanted = (v_render[camera], v_alpha[camera], v_pairs)
+        _differentiate_tile(means2d, conics, colors, opacities, *listed, top, left, *image, *wanted)
+
+
+@_compiled(parallel=True)
+def sum_over_tiles(v_pairs: np.ndarray, starts: np.ndarray, order: np.ndarray, v_gaussians: np.ndarray) -> None:
+    """Add the rows ``starts[i]:starts[i+1]`` of ``v_pairs [K,F]`` into row ``order[i]`` of ``v_gaussians [M,F]``."""
+    for i in numba.prange(len(order)):
+        for row in range(starts[i], starts[i + 1]):
+            for f in range(v_pairs.shape[1]):
+                v_gaussians[order[i], f] += v_pairs[row, f]
