@@ -25,7 +25,7 @@ from kronc_ns.starts import MIN_POINTS, Start, far_side, in_front, usable_views
 _NO_CHANCE = 8  # a pose can be bent to meet three detections; eight do not agree by accident
 _PADDING = 8  # views are padded to a multiple, so that scenes of similar size share a batch
 _BATCH_VIEWS = 400  # views in a batch: what stays in the processor's cache
-_REFINEMENTS = 4  # rounds of undistortion with the k1 found
+_REFINEMENTS = 3  # more rounds of undistortion with the k1 found
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,16 @@ def _run(
     device = torch.device("cuda" if config.device == "cuda" else "cpu")
     refine = (*(("focal",) if config.refine_focal else ()), *(("k1",) if config.refine_k1 else ()))
     began = starts
-    for _ in range(_REFINEMENTS if config.refine_k1 else 1):
+
+    def solve() -> tuple[Problem, LmResult]:
         problem, state = _problem(starts, views, refine, shape_prior(starts[0].scene.schema))
-        problem, state = (x.each(lambda t: t.to(device)) for x in (problem, state))
-        result = adjust(problem, state, config.lm, progress)
+        problem = problem.each(lambda t: t.to(device))
+        return problem, adjust(problem, state.each(lambda t: t.to(device)), config.lm, progress)
+
+    problem, result = solve()
+    starts = [_moved(start, result, i, refine) for i, start in enumerate(starts)]
+    for _ in range(_REFINEMENTS if config.refine_k1 else 0):
+        problem, result = solve()
         starts = [_moved(start, result, i, refine) for i, start in enumerate(starts)]
     inlier = result.inlier
     covariance = camera_covariance(problem, result.state, inlier, result.sigma_px, result.shape_weight)

@@ -1,5 +1,6 @@
 """Many scene folders solved in one go."""
 
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -68,6 +69,9 @@ def solve_folders(folders: Sequence[Path], output_dir: Path, config: KroncConfig
         table.add_row(outcome.folder.name, outcome.status, outcome.reason)
     Console().print(table)
     print(output_dir)
+    for outcome in outcomes:
+        if outcome.status != Status.CONVERGED.value:
+            print(f"{outcome.status}: {outcome.folder}: {outcome.reason}", file=sys.stderr)
     if any(outcome.status == "error" for outcome in outcomes):
         return 2
     return 0 if all(outcome.status == Status.CONVERGED.value for outcome in outcomes) else 3

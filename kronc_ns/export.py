@@ -103,10 +103,12 @@ def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, i
     names = [_relative(data, name, folder) for name in solution.names]
     masks = [_relative(data, mask, folder) for mask in scene.masks] if scene.masks else None
     content = transforms_dict(solution.camera, names, solution.c2w, masks)
-    content["ply_file_path"] = "keypoints.ply"
     known = solution.points[solution.points.isfinite().all(-1)]
-    with atomic_path(folder / "keypoints.ply") as path:
-        trimesh.PointCloud(known.numpy(), colors=np.tile([[200, 40, 40, 255]], (len(known), 1))).export(path)
+    (folder / "keypoints.ply").unlink(missing_ok=True)
+    if len(known):
+        content["ply_file_path"] = "keypoints.ply"
+        with atomic_path(folder / "keypoints.ply") as path:
+            trimesh.PointCloud(known.numpy(), colors=np.tile([[200, 40, 40, 255]], (len(known), 1))).export(path)
     write_json(folder / "transforms.json", content)
     report = {**solution_dict(solution), "keypoint_schema": scene.schema.name, "inputs": inputs}
     write_json(folder / "kronc.json", report)

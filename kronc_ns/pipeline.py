@@ -277,10 +277,10 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig) -> Solution:
         sigma_rot_deg=variance[:, :3].sum(1).sqrt().rad2deg(),
         sigma_trans_m=variance[:, 3:].sum(1).sqrt() * placement.scale,
         swapped=start.swapped,
-        shape_weight=None if car_template(scene.schema) is None else attempt.shape_weight,
+        shape_weight=attempt.shape_weight if config.solver == "lm" and car_template(scene.schema) else None,
     )
     views, status, reason, rmse_px, median_px = verify(start.scene, solution, evidence)
-    if status is not Status.CONVERGED and config.init == "circular":
+    if status is not Status.CONVERGED and start.name == "circular":
         reason += "; was the lap walked the other way (direction cw), or not whole (laps)? init auto finds out"
     if attempt.choice:
         reason += f"; {attempt.choice}"

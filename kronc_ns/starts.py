@@ -1,5 +1,6 @@
 """Where the second-order solver may start: given poses, circles, or a car template found in every view by itself."""
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -19,6 +20,7 @@ from kronc_ns.solve.resection import AWAY, locate
 
 MIN_POINTS = 4
 """A view with fewer keypoints cannot be placed by them alone (three points have up to four poses)."""
+_WAYS: tuple[Direction, ...] = ("ccw", "cw")
 _ALL_LAPS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 _TEMPLATE_TOLERANCE = 0.03  # of the car's extent in the image: about 13 cm on the car
 TOLERANCE_SIGMAS = 3.0
@@ -81,10 +83,11 @@ def start_from_template(scene: Scene) -> Start:
 
 def circles(scene: Scene, config: KroncConfig) -> list[Start]:
     """Starts at level circles: as the options say and, with ``init="auto"``, both ways and other shares of a lap."""
-    kinds: list[tuple[Direction, float]] = [(config.direction, config.laps)]
+    asked: tuple[Direction, float] = (config.direction, config.laps)
+    kinds = [asked]
     if config.init == "auto":
-        ways: tuple[Direction, ...] = ("ccw", "cw")
-        kinds += [(way, laps) for laps in _ALL_LAPS for way in ways if (way, laps) != kinds[0]]
+        everything = itertools.product(_ALL_LAPS, _WAYS)
+        kinds += [(way, laps) for laps, way in everything if (way, laps) != asked]
     return [
         start_from_poses(
             "circular" if config.init == "circular" else f"circular ({way}, {laps:g} lap{'s' if laps > 1 else ''})",
@@ -105,7 +108,12 @@ def locate_views(
 ) -> tuple[Float[Tensor, "n 3 4"], Float[Tensor, "n"], Bool[Tensor, "n"]]:
     """Pose, cost and whether left and right are swapped, of the chosen views by themselves (others: NaN, inf, no)."""
     template, camera = car_template(scene.schema), scene.camera
+    c2w = torch.full((len(scene), 3, 4), math.nan, dtype=torch.float64)
+    cost = torch.full((len(scene),), math.inf, dtype=torch.float64)
+    swapped = torch.zeros(len(scene), dtype=torch.bool)
     index = chosen.nonzero()[:, 0]
+    if not len(index):
+        return c2w, cost, swapped
     has_sides = any(j != f for j, f in enumerate(scene.schema.flip))
     variants = [scene.keypoints[index]]
     if has_sides:
@@ -130,9 +138,6 @@ def locate_views(
     )
     poses, costs = invert(found.w2c).unflatten(0, (len(variants), -1)), found.cost.view(len(variants), -1)
     flipped = costs[-1] < _SWAP_GAIN * costs[0]
-    c2w = torch.full((len(scene), 3, 4), math.nan, dtype=torch.float64)
-    cost = torch.full((len(scene),), math.inf, dtype=torch.float64)
-    swapped = torch.zeros(len(scene), dtype=torch.bool)
     c2w[index] = torch.where(flipped[:, None, None], poses[-1], poses[0])
     cost[index] = torch.where(flipped, costs[-1], costs[0])
     swapped[index] = flipped

@@ -20,6 +20,10 @@ POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
 _VAGUE_DEG = 5.0
 """A median standard deviation of the rotations above this is close to degenerate."""
+_PARALLAX_DEG = 3.0
+"""Views that see the points from within this angle hardly tell how far these are."""
+_ALIKE = 0.005
+"""Keypoints that move less than this share of the diagonal between views show no other side."""
 _ODD_SHAPE = 0.25
 """Weight of the shape prior below which the solved points hardly look like a car."""
 
@@ -83,7 +87,7 @@ def verify(scene: Scene, solution: Solution, evidence: Evidence) -> tuple[list[V
     total = float((torch.where(kept, error.square(), 0.0).sum() / kept.sum().clamp_min(1)).sqrt())
     measured = error[error.isfinite()]
     overall = float(measured.median()) if len(measured) else math.inf
-    status, reason = _judge(scene, solved, overall, evidence)
+    status, reason = _judge(scene, solution, solved, overall, evidence)
     return reports, status, reason, total, median
 
 
@@ -116,7 +120,9 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _judge(scene: Scene, solved: Bool[Tensor, "n"], median_px: float, evidence: Evidence) -> tuple[Status, str]:
+def _judge(
+    scene: Scene, solution: Solution, solved: Bool[Tensor, "n"], median_px: float, evidence: Evidence
+) -> tuple[Status, str]:
     share = median_px / math.hypot(scene.camera.width, scene.camera.height)
     count, views = int(solved.sum()), len(scene)
     fit = f"median reprojection error {median_px:.2f} px ({100 * share:.2f} % of the image diagonal)"
@@ -132,6 +138,8 @@ def _judge(scene: Scene, solved: Bool[Tensor, "n"], median_px: float, evidence: 
         problems.append("the keypoints fit poorly")
     if 2 * count < views:
         problems.append(f"only {count} of {views} views are solved")
+    if count > 1 and (_parallax_deg(solution, solved) < _PARALLAX_DEG or _all_alike(scene, solved)):
+        problems.append("all views are from the same place: take them from around the object")
     if not vague <= _VAGUE_DEG:
         problems.append(f"the views are barely determined (median standard deviation {vague:.1f} deg): take more views")
     if evidence.shape_weight is not None and evidence.shape_weight < _ODD_SHAPE:
@@ -139,3 +147,18 @@ def _judge(scene: Scene, solved: Bool[Tensor, "n"], median_px: float, evidence: 
     if problems:
         return Status.WEAK, f"{'; '.join(problems)}; {fit}"
     return Status.CONVERGED, f"{count} of {views} views solved; {fit}"
+
+
+def _parallax_deg(solution: Solution, solved: Bool[Tensor, "n"]) -> float:
+    """Largest angle between the mean direction from which the points are seen and that of a view."""
+    middle = solution.points.nanmean(0)
+    direction = torch.nn.functional.normalize(solution.c2w[solved][..., 3] - middle, dim=-1)
+    mean = torch.nn.functional.normalize(direction.mean(0), dim=0)
+    return math.degrees(math.acos(max(-1.0, min(1.0, float((direction @ mean).min())))))
+
+
+def _all_alike(scene: Scene, solved: Bool[Tensor, "n"]) -> bool:
+    """Whether the views show the same picture: then poses differ by the start's doing only."""
+    uv = torch.where(scene.visibility[..., None] > 0, scene.uv, math.nan)[solved]
+    middle = uv.nanmedian(0).values
+    return float((uv - middle).norm(dim=-1).nanmedian()) < _ALIKE * math.hypot(scene.camera.width, scene.camera.height)

@@ -25,7 +25,7 @@ _AZIMUTHS = 24
 _ELEVATIONS_DEG = (-5.0, 15.0, 35.0, 60.0)
 _ROLLS_DEG = (0.0, 90.0, 180.0, 270.0)
 _REFINED = 4
-_SAMPLES = 1000
+_SAMPLE, _SAMPLES = 4, 1000  # points OpenCV draws at a time, and how often
 AWAY = -0.25
 """A point whose normal makes a larger angle with its ray (cosine below this) cannot be seen."""
 
@@ -129,11 +129,13 @@ def _consensus(
     found = torch.eye(3, 4, dtype=points.dtype).repeat(len(points), 1, 1)
     cv2.setRNGSeed(0)
     for i, seen in enumerate((weight > 0).cpu()):
+        if int(seen.sum()) < _SAMPLE:
+            continue
         ok, turn, shift, _ = cv2.solvePnPRansac(
             points[i, seen].cpu().numpy(),
             plane[i, :, seen].T.contiguous().cpu().numpy(),
             np.eye(3),
-            None,
+            np.zeros(4),
             iterationsCount=_SAMPLES,
             reprojectionError=float(tolerance[i]),
             flags=cv2.SOLVEPNP_AP3P,
