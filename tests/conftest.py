@@ -20,21 +20,25 @@ with jaxtyping.install_import_hook(
         "kronc_ns.keypoints",
         "kronc_ns.frame",
         "kronc_ns.orbit",
+        "kronc_ns.starts",
         "kronc_ns.adjustment",
+        "kronc_ns.repair",
+        "kronc_ns.completion",
         "kronc_ns.evaluate",
     ],
     "beartype.beartype",
 ):
-    import kronc_ns.adjustment
+    import kronc_ns.completion
     import kronc_ns.evaluate
     import kronc_ns.init
     import kronc_ns.keypoints.select
     import kronc_ns.objective
-    import kronc_ns.orbit
+    import kronc_ns.repair
     import kronc_ns.solve.adam  # noqa: F401
 
 import torch
 
+from kronc_ns.init import noisy_poses
 from kronc_ns.scene import Scene
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, make_capture
@@ -55,6 +59,18 @@ def spin_suv() -> Path:
 def walk_capture() -> Capture:
     """A walk of 16 views with half a pixel of noise."""
     return make_capture("walk", views=16, seed=7, noise_px=0.5)
+
+
+@pytest.fixture(scope="session")
+def lap() -> Capture:
+    """A walk of 20 views with 0.7 px of noise."""
+    return make_capture("walk", views=20, seed=4, noise_px=0.7)
+
+
+@pytest.fixture(scope="session")
+def lap_start(lap: Capture) -> torch.Tensor:
+    """Its poses with (4 deg, 0.5 m) of noise."""
+    return noisy_poses(lap.c2w, 4.0, 0.5, torch.Generator().manual_seed(0))
 
 
 @pytest.fixture

@@ -29,7 +29,9 @@ def views_of(points: Tensor, c2w: Tensor, noise_px: float = 0.0) -> Tensor:
     return uv + noise_px * randn(*uv.shape, seed=3)
 
 
-def found(points: Tensor, uv: Tensor, weight: Tensor | None = None, normals: Tensor | None = None) -> Located:
+def found(
+    points: Tensor, uv: Tensor, weight: Tensor | None = None, normals: Tensor | None = None, exact: bool = False
+) -> Located:
     views = len(uv)
     return locate(
         points.expand(views, -1, -1),
@@ -38,6 +40,7 @@ def found(points: Tensor, uv: Tensor, weight: Tensor | None = None, normals: Ten
         FOCAL.expand(views, 2),
         torch.full((views,), 3.0, dtype=torch.float64),
         normals,
+        exact,
     )
 
 
@@ -62,9 +65,10 @@ def rolled(c2w: Tensor, degrees: float) -> Tensor:
 
 
 @pytest.mark.parametrize("height_m", [0.3, 1.5, 4.0, 9.0])
-def test_exact_points_give_the_exact_pose_from_every_side(height_m):
+@pytest.mark.parametrize("exact", [False, True])
+def test_exact_points_give_the_exact_pose_from_every_side(height_m, exact):
     c2w = around(36, height_m=height_m, phase=0.37)
-    located = found(TEMPLATE.mean, views_of(TEMPLATE.mean, c2w))
+    located = found(TEMPLATE.mean, views_of(TEMPLATE.mean, c2w), exact=exact)
     rotation, centre = off(located, c2w)
     assert rotation.max() < 1e-3
     assert centre.max() < 1e-4
@@ -83,6 +87,17 @@ def visible(c2w: Tensor) -> Tensor:
     """Points whose side of the car faces the camera."""
     ray = torch.nn.functional.normalize(c2w[:, None, :, 3] - TEMPLATE.mean, dim=-1)
     return ((ray * TEMPLATE.normals).sum(-1) > 0.1).double()
+
+
+def test_half_of_the_detections_may_be_outliers_where_the_points_are_exact():
+    c2w = around(24, phase=0.37)
+    uv = views_of(TEMPLATE.mean, c2w, noise_px=0.5)
+    wild = torch.rand(24, 66, generator=generator(1)) < 0.5
+    anywhere = 250 * (torch.rand(uv.shape, dtype=torch.float64, generator=generator(2)) - 0.5)
+    located = found(TEMPLATE.mean, torch.where(wild[:, None], anywhere, uv), visible(c2w), TEMPLATE.normals, exact=True)
+    rotation, centre = off(located, c2w)
+    assert (rotation < 3).double().mean() > 0.85
+    assert (centre < 0.3).double().mean() > 0.85
 
 
 def test_outliers_do_not_count():
@@ -159,11 +174,13 @@ def test_size_and_place_of_the_points_do_not_matter_as_long_as_up_is_up():
     assert centre.max() < 1e-3
 
 
-def test_views_without_any_point_have_no_cost_that_is_not_a_number():
+@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("count", range(4))
+def test_views_with_too_few_points_have_no_cost_that_is_not_a_number(count, exact):
     weight = torch.ones(3, 66, dtype=torch.float64)
-    weight[1] = 0
+    weight[1, count:] = 0
     c2w = around(3, phase=0.37)
-    located = found(TEMPLATE.mean, views_of(TEMPLATE.mean, c2w), weight)
+    located = found(TEMPLATE.mean, views_of(TEMPLATE.mean, c2w), weight, exact=exact)
     assert located.cost.isfinite().all()
     assert off(located, c2w)[0][[0, 2]].max() < 1e-3
 
