@@ -1,20 +1,26 @@
+import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from kronc_ns.errors import KroncError
-from kronc_ns.frame import car_axes
-from kronc_ns.geometry.alignment import pose_errors, umeyama
+from kronc_ns.export import claim_output, write_solution
+from kronc_ns.frame import car_axes, template_frame
+from kronc_ns.geometry.alignment import Similarity, pose_errors, umeyama
 from kronc_ns.geometry.rotations import rotation_angle_deg, so3_exp
 from kronc_ns.init import noisy_poses
-from kronc_ns.keypoints.schema import APOLLOCAR3D_66
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
+from kronc_ns.keypoints.template import car_template
 from kronc_ns.pipeline import KroncConfig, fingerprint, solve_scene
 from kronc_ns.scene import Scene, load_scene
 from kronc_ns.solve.adam import AdamConfig
 from kronc_ns.solve.solution import Status, ViewStatus
-from kronc_ns.synthetic.scenes import make_capture
+from kronc_ns.synthetic.car import CarShape, build_car
+from kronc_ns.synthetic.scenes import Capture, default_camera, make_capture, observe, walk_poses
+from kronc_ns.synthetic.variations import empty_views, reverse, shuffle, swap_sides
 from kronc_ns.verify import residuals_px
 from tests.conftest import scene_of
 
@@ -172,7 +178,7 @@ def test_views_without_overlap_are_never_trusted(noisy, solver):
     keypoints[..., 2] = 0
     for view in range(3):
         keypoints[view, 5 * view : 5 * view + 5] = torch.tensor([10.0, 20.0, 1.0], dtype=torch.float64)
-    solution = solve_scene(replace(noisy, keypoints=keypoints), replace(QUICK, solver=solver))
+    solution = solve_scene(replace(noisy, keypoints=keypoints), replace(QUICK, solver=solver, init="given"))
     assert solution.status is not Status.CONVERGED
     assert solution.reason
 
@@ -223,6 +229,253 @@ def test_fingerprint_knows_contents_and_options_but_no_paths(noisy):
     keypoints = noisy.keypoints.clone()
     keypoints[0, 0, 0] += 1e-6
     assert fingerprint(noisy, QUICK) != fingerprint(replace(noisy, keypoints=keypoints), QUICK)
+
+
+# ---- the default: lm from wherever the inputs allow
+
+
+@pytest.fixture(scope="module")
+def scene(lap) -> Scene:
+    return scene_of(lap)
+
+
+def assert_recovered(solution, capture, degrees=1.0):
+    assert solution.status is Status.CONVERGED, solution.reason
+    assert all(view.status is ViewStatus.SOLVED for view in solution.views)
+    assert pose_errors(solution.c2w, capture.c2w)[0].mean() < degrees
+
+
+def walk(views: int = 20, noise_px: float = 1.0, seed: int = 3, **options) -> Capture:
+    rng = np.random.default_rng(seed)
+    return observe(build_car(CarShape()), walk_poses(views, rng, **options), default_camera("walk"), rng, noise_px)
+
+
+CAPTURES = {
+    "a walk": lambda: walk(),
+    "a hemisphere": lambda: make_capture("carpatch", views=20, seed=3, noise_px=1.0),
+    "clockwise": lambda: walk(clockwise=True),
+    "half a lap": lambda: walk(laps=0.5),
+    "a lap and a half": lambda: walk(30, laps=1.5),
+    "the last view first": lambda: reverse(walk()),
+    "in any order": lambda: shuffle(walk(), np.random.default_rng(0)),
+    "with one detection in ten wrong": lambda: make_capture("walk", views=20, seed=3, noise_px=1.0, outliers=0.1),
+}
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_no_initial_pose_is_needed(name):
+    capture = CAPTURES[name]()
+    solution = solve_scene(scene_of(capture))
+    assert_recovered(solution, capture)
+    assert solution.solver == "lm"
+    assert_stands_as(solution.points, capture.points)
+
+
+def test_the_reason_says_where_it_started(scene, lap, lap_start):
+    assert "start: template" in solve_scene(scene).reason
+    assert "start: given" in solve_scene(replace(scene, given_c2w=lap_start)).reason
+    assert "start: circular" in solve_scene(scene, KroncConfig(init="circular", radius_m=5.0)).reason
+
+
+def test_useless_given_poses_do_no_harm(scene, lap):
+    elsewhere = lap.c2w[torch.from_numpy(np.random.default_rng(0).permutation(20))]
+    solution = solve_scene(replace(scene, given_c2w=elsewhere))
+    assert_recovered(solution, lap)
+    assert "start: " in solution.reason
+    to_truth = umeyama(solution.c2w[..., 3], lap.c2w[..., 3])
+    assert float(to_truth.scale) == pytest.approx(1.0, abs=0.1), "their scale is as useless"
+
+
+def test_given_poses_keep_their_frame_and_scale(scene, lap, lap_start):
+    world = Similarity(
+        torch.tensor(0.4, dtype=torch.float64),
+        so3_exp(torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64)),
+        torch.tensor([5.0, -2.0, 3.0], dtype=torch.float64),
+    )
+    given = world.apply_to_poses(lap_start)
+    solution = solve_scene(replace(scene, given_c2w=given))
+    assert solution.init == "given"
+    assert_recovered(solution, lap)
+    to_given = umeyama(solution.c2w[..., 3], given[..., 3])
+    assert float(to_given.scale) == pytest.approx(1.0, abs=1e-6)
+    assert rotation_angle_deg(to_given.rotation) < 1e-4
+    assert to_given.translation.norm() < 1e-6
+    sigma = torch.tensor([view.sigma_trans_m for view in solution.views])
+    metres = torch.tensor([view.sigma_trans_m for view in solve_scene(scene).views])
+    assert float((sigma / metres).median()) == pytest.approx(0.4, rel=0.05)
+
+
+@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("solver", ["lm", "adam"])
+def test_the_cars_length_sets_the_scale(scene, lap_start, solver, given):
+    config = replace(QUICK, solver=solver, car_length_m=5.5, radius_m=5.0)
+    given_c2w = lap_start if given else None
+    solution = solve_scene(replace(scene, given_c2w=given_c2w), config)
+    free = solve_scene(replace(scene, given_c2w=given_c2w), replace(config, car_length_m=None))
+    template = car_template(APOLLOCAR3D_66)
+    frame = template_frame(free.points, template)
+    true_length = template.length_m(frame.apply(free.points)) / float(frame.scale)
+    growth = umeyama(free.points, solution.points).scale
+    assert float(growth) * true_length == pytest.approx(5.5, rel=1e-3)
+    if not given:
+        back = template_frame(solution.points, template)
+        in_metres = template.length_m(back.apply(solution.points)) / float(back.scale)
+        assert in_metres == pytest.approx(5.5, rel=1e-3)
+        assert solution.points[list(APOLLOCAR3D_66.wheels), 2].abs().mean() < 0.7, "still on the ground"
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.25])
+def test_a_focal_length_a_quarter_off_is_found(factor):
+    capture = make_capture("walk", views=30, seed=3, noise_px=1.0)
+    wrong = replace(capture.camera, fx=400.0 * factor, fy=400.0 * factor)
+    solution = solve_scene(replace(scene_of(capture), camera=wrong), KroncConfig(refine_focal=True))
+    assert solution.camera.fx == pytest.approx(400.0, rel=0.015)
+    assert solution.camera.fy == pytest.approx(400.0, rel=0.015)
+    assert_recovered(solution, capture)
+    assert solution.median_px < 1.5
+
+
+def bent(capture: Capture, k1: float) -> Scene:
+    """The scene through a lens with distortion; its camera does not know."""
+    scene, camera = scene_of(capture), capture.camera
+    centre, focal = torch.tensor([camera.cx, camera.cy]), torch.tensor([camera.fx, camera.fy])
+    plane = (scene.keypoints[..., :2] - centre) / focal
+    there = plane * (1 + k1 * plane.square().sum(-1, keepdim=True)) * focal + centre
+    uv = torch.where(scene.visibility[..., None] > 0, there, scene.keypoints[..., :2])
+    return replace(scene, keypoints=torch.cat([uv, scene.keypoints[..., 2:]], dim=-1))
+
+
+def test_radial_distortion_is_found():
+    capture = make_capture("walk", views=40, seed=3, noise_px=0.5)
+    solution = solve_scene(bent(capture, -0.05), KroncConfig(refine_k1=True))
+    assert solution.camera.k1 == pytest.approx(-0.05, rel=0.2)
+    assert_recovered(solution, capture, 0.5)
+    both = solve_scene(
+        replace(bent(capture, -0.05), camera=replace(capture.camera, fx=360.0, fy=360.0)),
+        KroncConfig(refine_k1=True, refine_focal=True),
+    )
+    assert both.camera.k1 == pytest.approx(-0.05, rel=0.3)
+    assert both.camera.fx == pytest.approx(400.0, rel=0.02)
+
+
+def test_intrinsics_are_left_alone_unless_asked(scene):
+    assert solve_scene(scene).camera == scene.camera
+
+
+PLAIN = KeypointSchema("things-66", (*APOLLOCAR3D_66.keypoints[:-1], "something else"), tuple(range(66)))
+
+
+@pytest.mark.parametrize("direction", ["ccw", "cw"])
+def test_something_without_a_template_needs_no_direction(direction):
+    capture = walk(12, noise_px=0.5, clockwise=True)
+    scene = replace(scene_of(capture), schema=PLAIN)
+    solution = solve_scene(scene, KroncConfig(direction=direction, radius_m=5.0))
+    assert_recovered(solution, capture)
+    assert solution.init.startswith("circular (cw")
+    assert float(solution.c2w[..., 3].norm(dim=-1).mean()) == pytest.approx(5.0, rel=0.01)
+    up = -solution.c2w[..., 1].mean(0)
+    assert up[2] / up.norm() > 0.99
+
+
+@pytest.mark.parametrize("options", [{"init": "template"}, {"car_length_m": 4.0}])
+def test_something_without_a_template_refuses_what_needs_one(scene, options):
+    with pytest.raises(KroncError, match="things-66"):
+        solve_scene(replace(scene, schema=PLAIN), KroncConfig(**options))
+
+
+def test_confidences_count():
+    capture = make_capture("walk", views=16, seed=5, noise_px=0.3)
+    noise = 4.0 * torch.randn(16, 66, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    doubtful = torch.rand(16, 66, generator=torch.Generator().manual_seed(1)) < 0.5
+    keypoints = capture.keypoints.clone()
+    keypoints[..., :2] += torch.where((doubtful & (keypoints[..., 2] > 0))[..., None], noise, 0.0)
+    told = keypoints.clone()
+    told[..., 2] *= torch.where(doubtful, 0.01, 1.0)
+    flat, weighted = (solve_scene(replace(scene_of(capture), keypoints=k)) for k in (keypoints, told))
+    error = [pose_errors(solution.c2w, capture.c2w)[0].mean() for solution in (flat, weighted)]
+    assert error[1] < 0.8 * error[0]
+    scaled = keypoints.clone()
+    scaled[..., 2] *= 0.37
+    same = solve_scene(replace(scene_of(capture), keypoints=scaled))
+    torch.testing.assert_close(same.c2w, flat.c2w, rtol=0, atol=1e-6)
+
+
+def test_views_without_keypoints_are_placed_between_their_neighbours_or_left_out():
+    capture, empty = empty_views(make_capture("walk", views=30, seed=2, noise_px=1.0), 0.1, np.random.default_rng(4))
+    scene = scene_of(capture)
+    whole, measured = (solve_scene(scene, KroncConfig(min_status=status)) for status in ("completed", "solved"))
+    assert whole.status is measured.status is Status.CONVERGED
+    for solution, status in ((whole, ViewStatus.COMPLETED), (measured, ViewStatus.FAILED)):
+        assert [view.status is status for view in solution.views] == empty.tolist()
+    torch.testing.assert_close(whole.c2w[~empty], measured.c2w[~empty], rtol=0, atol=0)
+    assert measured.c2w[empty].isnan().all()
+    rotation, centre = pose_errors(whole.c2w, capture.c2w)
+    assert rotation[empty].max() < 6
+    assert centre[empty].max() < 0.4
+    sigma = torch.tensor([[view.sigma_rot_deg, view.sigma_trans_m] for view in whole.views])
+    assert (sigma[empty].amin(0) > 1.5 * sigma[~empty].median(0).values).all()
+    for view in (view for view, hidden in zip(whole.views, empty, strict=True) if hidden):
+        assert "between its neighbours" in view.reason
+        assert "0 keypoints" in view.reason
+        assert view.rmse_px is None
+
+
+def test_views_in_any_order_are_not_completed():
+    capture = shuffle(make_capture("walk", views=20, seed=2, noise_px=1.0), np.random.default_rng(0))
+    capture, empty = empty_views(capture, 0.1, np.random.default_rng(4))
+    solution = solve_scene(scene_of(capture))
+    assert [view.status is ViewStatus.FAILED for view in solution.views] == empty.tolist()
+
+
+def test_every_solved_view_has_sigmas_of_the_right_size():
+    share = []
+    for seed in range(4):
+        capture = make_capture("walk", views=16, seed=20 + seed, noise_px=1.0)
+        solution = solve_scene(scene_of(capture))
+        known = solution.points.isfinite().all(-1)
+        to_truth = umeyama(solution.points[known], capture.points[known])
+        aligned = to_truth.apply_to_poses(solution.c2w)
+        angle = rotation_angle_deg(aligned[..., :3].mT @ capture.c2w[..., :3])
+        centre = (aligned - capture.c2w)[..., 3].norm(dim=-1)
+        for view, degrees, metres in zip(solution.views, angle, centre, strict=True):
+            share.append([float(degrees) / view.sigma_rot_deg, float(metres) / view.sigma_trans_m])
+    rms = torch.tensor(share).square().mean(0).sqrt()
+    assert (rms > 0.75).all()
+    assert (rms < 1.25).all()
+
+
+def test_the_result_says_which_views_were_swapped_and_holds_no_nan(tmp_path, lap):
+    swapped, chosen = swap_sides(lap, 0.15, np.random.default_rng(1))
+    keypoints = swapped.keypoints.clone()
+    hidden = int(torch.nonzero(~chosen)[9])
+    keypoints[hidden] = 0
+    scene = replace(scene_of(swapped), keypoints=keypoints)
+    solution = solve_scene(scene)
+    claim_output(tmp_path / "out")
+    write_solution(tmp_path / "out", scene, solution, tmp_path, "inputs")
+
+    def refuse(token):
+        raise AssertionError(f"{token} is no JSON")
+
+    report = json.loads((tmp_path / "out/kronc.json").read_text(), parse_constant=refuse)
+    assert [view["swapped"] for view in report["views"]] == chosen.tolist()
+    assert [view["status"] for view in report["views"]] == ["completed" if i == hidden else "solved" for i in range(20)]
+    for view in report["views"]:
+        assert view["sigma_rot_deg"] > 0
+        assert view["sigma_trans_m"] > 0
+
+
+def test_the_same_input_gives_the_same_bits(scene):
+    first, second = solve_scene(scene), solve_scene(scene)
+    assert torch.equal(first.c2w, second.c2w)
+    assert torch.equal(first.points, second.points)
+    assert first.reason == second.reason
+
+
+def test_nothing_of_the_scene_is_changed(scene):
+    before = scene.keypoints.clone()
+    solve_scene(scene)
+    assert torch.equal(scene.keypoints, before)
 
 
 @pytest.mark.slow
