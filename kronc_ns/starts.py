@@ -1,6 +1,5 @@
 """Where the second-order solver may start: given poses, circles, or a car template found in every view by itself."""
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -20,8 +19,10 @@ from kronc_ns.solve.resection import AWAY, locate
 
 MIN_POINTS = 4
 """A view with fewer keypoints cannot be placed by them alone (three points have up to four poses)."""
-_WAYS: tuple[Direction, ...] = ("ccw", "cw")
-_ALL_LAPS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
+_CIRCLES: tuple[tuple[Direction, float], ...] = (
+    ("ccw", 1.0), ("cw", 1.0), ("ccw", 0.5), ("cw", 0.5), ("ccw", 1.5), ("cw", 1.5), ("ccw", 0.25), ("cw", 0.25),
+    ("ccw", 0.75), ("cw", 0.75), ("ccw", 1.25), ("cw", 1.25), ("ccw", 2.0), ("cw", 2.0),
+)  # fmt: skip
 _TEMPLATE_TOLERANCE = 0.03  # of the car's extent in the image: about 13 cm on the car
 TOLERANCE_SIGMAS = 3.0
 """What a detection may be off its solved point, in standard deviations, to count as met by half."""
@@ -84,10 +85,7 @@ def start_from_template(scene: Scene) -> Start:
 def circles(scene: Scene, config: KroncConfig) -> list[Start]:
     """Starts at level circles: as the options say and, with ``init="auto"``, both ways and other shares of a lap."""
     asked: tuple[Direction, float] = (config.direction, config.laps)
-    kinds = [asked]
-    if config.init == "auto":
-        everything = itertools.product(_ALL_LAPS, _WAYS)
-        kinds += [(way, laps) for laps, way in everything if (way, laps) != asked]
+    kinds = (asked, *(kind for kind in _CIRCLES if kind != asked)) if config.init == "auto" else (asked,)
     return [
         start_from_poses(
             "circular" if config.init == "circular" else f"circular ({way}, {laps:g} lap{'s' if laps > 1 else ''})",
