@@ -22,11 +22,13 @@ from torch import Tensor
 from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
 from kronc_ns.errors import KroncError
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import flip_camera_axes
 from kronc_ns.keypoints.io import read_json
 from kronc_ns.plugin.cache import read_report, solve_cached
 from kronc_ns.plugin.images import cut_out, downscaled
-from kronc_ns.plugin.seeds import seed_points
+from kronc_ns.plugin.seeds import Seeds, box_seeds, grey, ground_seeds
+from kronc_ns.plugin.visual_hull import carve, read_pictures
 from kronc_ns.scene import Scene, camera_and_frames, load_scene, read_poses
 from kronc_ns.solve.solution import Status
 
@@ -57,8 +59,11 @@ class KroncDataParserConfig(SolverOptions, DataParserConfig):
     """Size of the scene box relative to the car's (a margin of a tenth of its length is included)."""
     downscale_factor: int | None = None
     """Use images_2, images_4, ... of a processed folder; by default such that the longer side is below 1600 px."""
-    num_seed_points: int = 5000
-    """Points in the car's box that splatfacto starts from, besides the keypoints."""
+    seeds: Literal["hull", "box"] = "hull"
+    """What splatfacto starts from besides the keypoints. hull: the surface that the masks leave, with its colours;
+    box (and where there are no masks): random points in the car's box and on the ground."""
+    num_seed_points: int = 10_000
+    """How many such points, at the most."""
 
 
 @dataclass
@@ -129,6 +134,10 @@ class KroncDataParser(DataParser):
         missing = [path for path in [*images, *(masks or [])] if not path.exists()]
         if missing:
             raise KroncError(f"{missing[0]} does not exist: training needs the images ({len(missing)} are missing)")
+        seeds = grey(points)
+        if split == "train":  # models start from the training views' metadata
+            chosen_c2w = torch.stack([poses[PurePosixPath(scene.names[i]).name] for i in indices])
+            seeds += self._seeds(box, chosen_c2w, images, masks, camera)
         if config.background == "white" and masks is not None:
             images = cut_out(images, masks)
         cameras = Cameras(
@@ -145,7 +154,6 @@ class KroncDataParser(DataParser):
             camera_type=CameraType.PERSPECTIVE,
         )
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor.factor)
-        seeds, colours = seed_points(points, box, config.num_seed_points)
         return DataparserOutputs(
             image_filenames=images,
             cameras=cameras,
@@ -154,8 +162,29 @@ class KroncDataParser(DataParser):
             mask_filenames=masks if config.background == "mask" else None,
             dataparser_transform=move,
             dataparser_scale=scale,
-            metadata={"points3D_xyz": ((seeds - centre) * scale).float(), "points3D_rgb": colours},
+            metadata={"points3D_xyz": ((seeds.points - centre) * scale).float(), "points3D_rgb": seeds.colours},
         )
+
+    def _seeds(
+        self,
+        box: Float[Tensor, "2 3"],
+        c2w: Float[Tensor, "n 3 4"],
+        images: list[Path],
+        masks: list[Path] | None,
+        camera: Camera,
+    ) -> Seeds:
+        """Points to start from, in the solved world: the visual hull, or else random points."""
+        count = self.config.num_seed_points
+        if masks is not None and self.config.seeds == "hull":
+            points, colours = carve(read_pictures(images, masks, camera), c2w, box, count)
+            if len(points) and self.config.background == "keep":
+                return Seeds(points, colours) + ground_seeds(box, c2w, count // 2)
+            if len(points):
+                return Seeds(points, colours)
+            CONSOLE.print("[yellow]the masks leave nothing of the car in its box: starting from random points[/yellow]")
+        if masks is not None and self.config.background != "keep":
+            return box_seeds(box, count)
+        return box_seeds(box, count) + ground_seeds(box, c2w, count // 2)
 
 
 def test_views(views: int, interval: int, fraction: float | None) -> Bool[Tensor, "n"]:

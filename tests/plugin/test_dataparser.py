@@ -335,8 +335,8 @@ def test_downscaled_images_come_with_their_intrinsics(changed, outputs):
     assert all(PurePosixPath(path).parent.name == "masks_2" for path in masks)
 
 
-def test_seed_points_fill_the_box_and_hold_the_keypoints(outputs, solution):
-    output, again = outputs(num_seed_points=700), outputs(num_seed_points=700)
+def test_random_seed_points_fill_the_box_and_hold_the_keypoints(outputs, solution):
+    output, again = (outputs(num_seed_points=700, seeds="box") for _ in range(2))
     points, colours = output.metadata["points3D_xyz"], output.metadata["points3D_rgb"]
     known = solution.points[solution.points.isfinite().all(-1)]
     assert len(points) == len(colours) == 700 + len(known)
@@ -348,6 +348,28 @@ def test_seed_points_fill_the_box_and_hold_the_keypoints(outputs, solution):
     keypoints = scale * (known.float() @ move[:, :3].T + move[:, 3])
     assert torch.cdist(keypoints, points).amin(1).max() < 1e-3
     assert torch.equal(points, again.metadata["points3D_xyz"])
+
+
+def test_the_visual_hull_is_on_the_car_and_has_its_colours(outputs, solution):
+    output = outputs(num_seed_points=3000)
+    known = int(solution.points.isfinite().all(-1).sum())
+    points, colours = output.metadata["points3D_xyz"][known:], output.metadata["points3D_rgb"][known:]
+    assert 300 < len(points) <= 3000
+    keypoints = output.metadata["points3D_xyz"][:known]
+    length = (keypoints.amax(0) - keypoints.amin(0)).max()
+    off = torch.cdist(points, keypoints).amin(1)
+    assert off.median() < 0.12 * length  # keypoints are on the surface
+    blue = colours.float().mean(0)
+    assert blue[2] > blue[0] + 15, "the procedural car is blue"
+
+
+def test_without_masks_seeds_lie_on_the_ground_too(outputs):
+    with_ground = outputs(num_seed_points=600, seeds="box", background="keep").metadata["points3D_xyz"]
+    without = outputs(num_seed_points=600, seeds="box").metadata["points3D_xyz"]
+    assert len(with_ground) == len(without) + 300
+    ground = with_ground[-300:]
+    assert (ground[:, 2] == ground[0, 2]).all()
+    assert ground[:, :2].norm(dim=1).max() > 0.8
 
 
 # ---- what a user can get wrong
