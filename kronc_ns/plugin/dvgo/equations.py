@@ -43,9 +43,9 @@ def background_entropy(background: Float[Tensor, "r"]) -> Float[Tensor, ""]:
     return -(seen * seen.log() + (1 - seen) * (1 - seen).log()).mean()
 
 
-def total_variation(values: Float[Tensor, "c x y z"]) -> Float[Tensor, ""]:
+def total_variation(values: Float[Tensor, "x y z c"]) -> Float[Tensor, ""]:
     """Mean squared difference of neighbouring grid points, summed over the three axes."""
-    return torch.stack([values.diff(dim=axis).square().mean() for axis in (1, 2, 3)]).sum()
+    return torch.stack([values.diff(dim=axis).square().mean() for axis in range(3)]).sum()
 
 
 def grid_shape(aabb: Float[Tensor, "2 3"], voxels: int) -> tuple[int, int, int]:

@@ -40,7 +40,7 @@ class DensityGridField(Field):
     @torch.no_grad()
     def alpha_at_nodes(self, step: float) -> Float[Tensor, "x y z"]:
         """Alpha of the grid's points over ``step`` voxels."""
-        return equations.alpha(equations.density(self.density_grid.at_nodes()[0], self.bias), step)
+        return equations.alpha(equations.density(self.density_grid.at_nodes()[..., 0], self.bias), step)
 
 
 class CoarseField(DensityGridField):
@@ -105,6 +105,8 @@ class FineField(DensityGridField):
     ) -> dict[FieldHeadNames, Float[Tensor, "*n 3"]]:
         """Colours in 0..1: MLP(interp(x, V), x, d) with encoded x and d (section 5.2)."""
         positions = ray_samples.frustums.get_positions()
+        if not positions.numel():  # nerfstudio's encodings fail at nothing
+            return {FieldHeadNames.RGB: torch.zeros_like(positions)}
         points = positions.reshape(-1, 3)
         low, high = self.feature_grid.aabb
         directions = (ray_samples.frustums.directions.reshape(-1, 3) + 1) / 2

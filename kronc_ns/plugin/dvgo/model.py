@@ -4,7 +4,6 @@ One run of the trainer covers both. What the model is at a step follows from the
 any checkpoint; the tensors in the checkpoint bring their shapes along.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -140,7 +139,7 @@ class DVGOModel(Model):
             grid = self.coarse.density_grid
             assert pipeline.datamanager.train_dataset is not None
             cameras = pipeline.datamanager.train_dataset.cameras
-            grid.rate.copy_(view_rates(grid.nodes(), cameras)[None])
+            grid.rate.copy_(view_rates(grid.nodes(), cameras)[..., None])
         return [
             TrainingCallback(
                 where_to_run=[TrainingCallbackLocation.BEFORE_TRAIN_ITERATION],
@@ -158,10 +157,21 @@ class DVGOModel(Model):
         if not self.is_fine:
             with exit_on_error():
                 self.begin_fine(voxels)
-            _forget(optimizers, "coarse", self.coarse.parameters())
+            self._renew(optimizers, "coarse")
+            self._renew(optimizers, "fine")
         elif self.fine.grow(voxels):
-            # moments of the old grid mean nothing for the new one's points, and its gradients are smaller
-            _forget(optimizers, "fine", (self.fine.density_grid.values, self.fine.feature_grid.values))
+            self._renew(optimizers, "fine")
+
+    def _renew(self, optimizers: Optimizers, group: str) -> None:
+        """Hand the new Parameters of a group to its optimiser, whose learning rate and schedule go on.
+
+        Moments start anew: a finer grid's points get smaller gradients, for which the old ones would be too large.
+        """
+        parameters = self.get_param_groups()[group]
+        optimizer = optimizers.optimizers[group]
+        optimizer.state.clear()
+        optimizer.param_groups[0]["params"] = parameters
+        optimizers.parameters[group] = parameters
 
     def voxels_at(self, fine_step: int) -> int:
         """Voxels of the fine grids at a step of the fine stage: doubled at every growth step, full after the last."""
@@ -259,9 +269,3 @@ class DVGOModel(Model):
 
 def _for_metrics(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
     return image.movedim(-1, 0)[None]
-
-
-def _forget(optimizers: Optimizers, group: str, parameters: Iterable[Parameter]) -> None:
-    """Drop the moments of parameters whose tensors were replaced; the Parameter objects are the same."""
-    for parameter in parameters:
-        optimizers.optimizers[group].state.pop(parameter, None)
