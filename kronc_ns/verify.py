@@ -159,6 +159,7 @@ def _parallax_deg(solution: Solution, solved: Bool[Tensor, "n"]) -> float:
 
 def _all_alike(scene: Scene, solved: Bool[Tensor, "n"]) -> bool:
     """Whether the views show the same picture: then poses differ by the start's doing only."""
-    uv = torch.where(scene.visibility[..., None] > 0, scene.uv, math.nan)[solved]
+    shared = (scene.visibility > 0) & (scene.visibility[solved].sum(0) > 1)
+    uv = torch.where(shared[..., None], scene.uv, math.nan)[solved]
     middle = uv.nanmedian(0).values
     return float((uv - middle).norm(dim=-1).nanmedian()) < _ALIKE * math.hypot(scene.camera.width, scene.camera.height)

@@ -29,14 +29,15 @@ equal in two dimensions, within 1.73 (root of chi-square's 5.99 over 2); if equa
 over 3). Camera errors lie between, their ellipsoids having one or two long axes: with right deviations 1.73 covers
 91.6 % (one dimension) to 97.1 % (three), inside the 90 to 98 % that are asked.
 """
-_GIVEN = KroncConfig(init="given")
+_DEFAULT = KroncConfig()
+"""What a user gets: poses that come with a scene are tried first."""
 
 
 def from_start(seed: int, start: tuple[float, float], views: int = 100, adam: bool = False) -> Figures:
     """Hemisphere, 1 px, from noisy poses; with ``adam`` the paper's 10,000 steps beside."""
     capture = make_capture("carpatch", views, seed, noise_px=1.0)
     given = noisy_start(capture, start, seed)
-    _, figures = solve_capture(capture, _GIVEN, given, best_poses(capture))
+    _, figures = solve_capture(capture, _DEFAULT, given, best_poses(capture))
     if adam:
         _, slow = solve_capture(capture, KroncConfig(solver="adam", init="given"), given)
         figures |= {f"adam_{name}": slow[name] for name in ("rotation_deg", "centre_cm", "seconds")}
@@ -92,7 +93,7 @@ def many_outliers(seed: int) -> Figures:
     """30 % outliers, beside the oracle and beside the optimum of the very same noise without outliers."""
     capture = make_capture("carpatch", 100, seed, noise_px=1.0, outliers=0.3)
     clean = make_capture("carpatch", 100, seed, noise_px=1.0)  # outliers replace detections: the others are the same
-    solution, figures = solve_capture(capture, _GIVEN, noisy_start(capture, USUAL_START, seed), best_poses(capture))
+    solution, figures = solve_capture(capture, _DEFAULT, noisy_start(capture, USUAL_START, seed), best_poses(capture))
     to_clean = solution_figures(solution, capture.c2w, best_poses(clean))
     return {**figures, "rotation_to_clean": to_clean["rotation_ratio"], "centre_to_clean": to_clean["centre_ratio"]}
 
@@ -110,7 +111,7 @@ def wrong_focal(seed: int, factor: float) -> Figures:
     true = capture.camera
     best = bundle_adjustment(capture_scene(capture), capture.c2w, capture.points, refine_focal=True)
     wrong = replace(capture, camera=replace(true, fx=true.fx * factor, fy=true.fy * factor))
-    config = replace(_GIVEN, refine_focal=True)
+    config = replace(_DEFAULT, refine_focal=True)
     solution, figures = solve_capture(wrong, config, noisy_start(capture, USUAL_START, seed), best.c2w)
     off, best_off = (abs(focal / true.fx - 1) for focal in (solution.camera.fx, best.focal_px))
     return {**figures, "focal_percent": 100 * off, "best_focal_percent": 100 * best_off}
@@ -128,8 +129,7 @@ def swapped_sides(capture: Capture, rng: np.random.Generator, start: bool, seed:
     """A tenth of the views with left and right swapped; the yardstick sees them as they were."""
     given = noisy_start(capture, USUAL_START, seed) if start else None
     swapped, truth = swap_sides(capture, 0.1, rng)
-    config = _GIVEN if start else KroncConfig()
-    solution, figures = solve_capture(swapped, config, given, best_poses(capture))
+    solution, figures = solve_capture(swapped, _DEFAULT, given, best_poses(capture))
     found = torch.tensor([view.swapped for view in solution.views])
     counts = {"found": found & truth, "missed": ~found & truth, "wrong": found & ~truth}
     return {**figures, **{name: float(which.sum()) for name, which in counts.items()}}
@@ -183,7 +183,7 @@ def judge_emptied(runs: Runs) -> Verdict:
 def coverage(seed: int, preset: Preset) -> Figures:
     """Share of views whose error, relative to the car's points, is inside the 95 % interval of their sigmas."""
     capture = make_capture(preset, 100, seed, noise_px=1.0)
-    solution, figures = solve_capture(capture, _GIVEN, noisy_start(capture, USUAL_START, seed))
+    solution, figures = solve_capture(capture, _DEFAULT, noisy_start(capture, USUAL_START, seed))
     known = solution.points.isfinite().all(-1)
     frame = umeyama(solution.points[known], capture.points[known])
     measured, sigma_rotation, sigma_centre = _sigmas(solution)

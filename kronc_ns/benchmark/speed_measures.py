@@ -21,7 +21,8 @@ from kronc_ns.scene import Scene
 from kronc_ns.solve.solution import Solution
 from kronc_ns.synthetic.scenes import Capture, make_capture
 
-_GIVEN = KroncConfig(init="given")
+_DEFAULT = KroncConfig()
+"""What a user gets: poses that come with a scene are tried first."""
 _ADAM = KroncConfig(solver="adam", init="given")
 _SIZES = (100, 400, 1600)
 _REPEATS = 3
@@ -49,7 +50,7 @@ def _timed(capture: Capture, start: torch.Tensor | None, config: KroncConfig) ->
 
 def warm(seed: int) -> Figures:
     """100 views from noisy poses."""
-    return _timed(*_posed_capture(seed), _GIVEN)
+    return _timed(*_posed_capture(seed), _DEFAULT)
 
 
 def without_pose(seed: int, shapes: Shapes) -> Figures:
@@ -76,7 +77,7 @@ def judge_warm(runs: Runs) -> Verdict:
 def against_adam(seed: int) -> Figures:
     """The default solver and the paper's 10,000 steps on the same scene from the same start."""
     capture, start = _posed_capture(seed)
-    ours = _timed(capture, start, _GIVEN)
+    ours = _timed(capture, start, _DEFAULT)
     solution, seconds = _solve(capture_scene(capture, start), _ADAM)
     adam = solution_figures(solution, capture.c2w)
     worse = any(ours[name] > adam[name] for name in ("rotation_deg", "centre_cm"))
@@ -112,7 +113,7 @@ def against_ceres(seed: int) -> Figures:
     """The default solver, whole, and pycolmap's adjustment alone on the same scene from the same start."""
     capture, start = _posed_capture(seed)
     scene = capture_scene(capture, start)
-    figures = dict(_timed(capture, start, _GIVEN))
+    figures = dict(_timed(capture, start, _DEFAULT))
     for name, (linear_solver, tolerance) in _CERES.items():
         found = bundle_adjustment(scene, start, linear_solver=linear_solver, function_tolerance=tolerance)
         rotation, centre = pose_errors(found.c2w, capture.c2w)
@@ -142,8 +143,8 @@ def growth(seed: int) -> Figures:
     for views in _SIZES:
         capture, start = _posed_capture(seed, views)
         scene = capture_scene(capture, start)
-        solve_scene(scene, _GIVEN)
-        figures[f"seconds_{views}"] = min(_solve(scene, _GIVEN)[1] for _ in range(_REPEATS))
+        solve_scene(scene, _DEFAULT)
+        figures[f"seconds_{views}"] = min(_solve(scene, _DEFAULT)[1] for _ in range(_REPEATS))
         figures[f"megabytes_{views}"] = _peak_megabytes(seed, views)
     return {**figures, "times_longer": figures["seconds_1600"] / figures["seconds_100"]}
 
@@ -165,7 +166,7 @@ def measure_peak(seed: int, views: int) -> float:
     """Megabytes by which solving a capture raises this process' resident memory at its peak (Linux only, else NaN)."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     small, start = _posed_capture(seed, 12)
-    solve_scene(capture_scene(small, start), _GIVEN)  # what is loaded once is no cost of a view
+    solve_scene(capture_scene(small, start), _DEFAULT)  # what is loaded once is no cost of a view
     scene = capture_scene(*_posed_capture(seed, views))
 
     def resident(which: str) -> float:
@@ -175,7 +176,7 @@ def measure_peak(seed: int, views: int) -> float:
     try:
         reset.write_text("5")  # the peak starts from now
         before = resident("VmRSS")
-        solve_scene(scene, _GIVEN)
+        solve_scene(scene, _DEFAULT)
         return resident("VmHWM") - before
     except (OSError, StopIteration):
         return math.nan
@@ -197,9 +198,9 @@ def throughput(seed: int, count: int) -> Figures:
     """Many scenes in one call: rate, and the largest difference of poses to solving the first ten one by one."""
     captures = [_posed_capture(seed + i) for i in range(count)]
     scenes = [capture_scene(capture, start) for capture, start in captures]
-    solve_scenes(scenes[:2], _GIVEN)
+    solve_scenes(scenes[:2], _DEFAULT)
     start = time.perf_counter()
-    solutions = solve_scenes(scenes, _GIVEN)
+    solutions = solve_scenes(scenes, _DEFAULT)
     seconds = time.perf_counter() - start
     errors, apart, failed = [], 0.0, 0
     for i, (solution, (capture, _)) in enumerate(zip(solutions, captures, strict=True)):
@@ -208,7 +209,7 @@ def throughput(seed: int, count: int) -> Figures:
             continue
         errors.append(solution_figures(solution, capture.c2w)["rotation_deg"])
         if i < 10:
-            apart = max(apart, float((solve_scene(scenes[i], _GIVEN).c2w - solution.c2w).abs().max()))
+            apart = max(apart, float((solve_scene(scenes[i], _DEFAULT).c2w - solution.c2w).abs().max()))
     worst = max(errors, default=math.inf)
     return {"scenes_per_s": count / seconds, "apart": apart, "failed_scenes": failed, "rotation_deg_worst": worst}
 
