@@ -132,7 +132,7 @@ def assert_says_what_it_is(solution: Solution, trouble: str, scene: Scene, folde
 @pytest.mark.parametrize(("schema", "init"), [(APOLLOCAR3D_66, "template"), (PLAIN, "circular")])
 def test_trouble_from_one_start_ends_in_a_status(trouble, schema, init, tmp_path):
     scene = scene_with(trouble, schema)
-    steps = 60 if init == "template" else 200
+    steps = 40 if init == "template" else 200
     solution = solve_scene(scene, KroncConfig(init=init, lm=LmConfig(iterations=steps)))
     assert_says_what_it_is(solution, trouble, scene, tmp_path / "out")
 

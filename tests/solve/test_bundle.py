@@ -231,7 +231,7 @@ def test_a_shape_prior_leaves_no_gauge():
 
 @pytest.mark.parametrize("variant", ["plain", "everything"])
 def test_a_batch_is_its_scenes_one_by_one(variant):
-    problem, state, weight, _ = systems(variant, batch=3)
+    problem, state, weight, system = systems(variant, batch=3)
     damping = torch.tensor([1e-3, 1.0, 10.0], dtype=torch.float64)
     together = solve_step(eliminate_cameras(system, damping), JOINTS)
     for i in range(3):
