@@ -15,6 +15,8 @@ from nerfstudio.data.scene_box import SceneBox  # noqa: E402
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes  # noqa: E402
 from nerfstudio.engine.optimizers import Optimizers  # noqa: E402
 
+from kronc_ns.benchmark.training import evaluate, run, train, write_variant  # noqa: E402
+from kronc_ns.pipeline import KroncConfig  # noqa: E402
 from kronc_ns.plugin.compatibility import UnavailableLpips  # noqa: E402
 from kronc_ns.plugin.dvgo import equations  # noqa: E402
 from kronc_ns.plugin.dvgo.field import view_rates  # noqa: E402
@@ -28,6 +30,8 @@ from kronc_ns.plugin.dvgo.grid import (  # noqa: E402
 from kronc_ns.plugin.dvgo.model import DVGOModel, DVGOModelConfig, StageLosses  # noqa: E402
 from kronc_ns.plugin.dvgo.sampling import ray_box, sample_rays  # noqa: E402
 from kronc_ns.plugin.methods import kronc_dvgo_cpu  # noqa: E402
+from kronc_ns.synthetic.folder import write_capture  # noqa: E402
+from kronc_ns.synthetic.scenes import default_camera, make_capture  # noqa: E402
 
 BOX = torch.tensor([[-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]])
 RADIUS = 0.4
@@ -387,3 +391,29 @@ def test_total_variation_is_an_option():
     assert run.losses["total_variation"] == 0  # all of the grid is the same
     run.step(1)
     assert run.losses["total_variation"] > 0
+
+
+@pytest.mark.slow
+def test_nerfstudio_trains_resumes_evaluates_and_renders_across_the_stages(tmp_path):
+    capture = make_capture("carpatch", views=24, seed=3, camera=default_camera("carpatch", 80))
+    write_capture(tmp_path / "capture", capture, render=True)
+    points = torch.from_numpy(capture.car.keypoints)
+    write_variant(tmp_path / "exact", tmp_path / "capture", "exact", KroncConfig(), points)
+    options = ["--pipeline.model.coarse-iterations", "150", "--pipeline.model.growth-steps", "60", "120"]
+    options += ["--pipeline.model.coarse-voxels", "13824", "--pipeline.model.fine-voxels", "64000"]
+    checkpoints, stages = None, []
+    for iterations in (140, 40, 220):  # within the coarse stage, across its end, and to the end of growth
+        resume = [] if checkpoints is None else ["--load-dir", str(checkpoints)]
+        steps = ["--max-num-iterations", str(iterations)]
+        name = tmp_path / f"runs_{iterations}"
+        config = train(tmp_path / "exact", "kronc-dvgo-cpu", name, [*options, *steps, *resume])
+        checkpoints = config.parent / "nerfstudio_models"
+        stages.append(evaluate(config)["psnr"])
+    assert [path.stem for path in checkpoints.glob("*.ckpt")] == ["step-000000399"]
+    print(stages)
+    assert stages[-1] > 20, stages
+    assert stages[-1] > stages[0], stages
+    output = tmp_path / "orbit.mp4"
+    arguments = ["--load-config", str(config), "--output-path", str(output)]
+    run("ns-render", "interpolate", *arguments, "--interpolation-steps", "2", "--downscale-factor", "2")
+    assert output.stat().st_size > 1000

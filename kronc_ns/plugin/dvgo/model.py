@@ -4,6 +4,7 @@ One run of the trainer covers both. What the model is at a step follows from the
 any checkpoint; the tensors in the checkpoint bring their shapes along.
 """
 
+import warnings
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -135,6 +136,8 @@ class DVGOModel(Model):
         optimizers, pipeline = training_callback_attributes.optimizers, training_callback_attributes.pipeline
         assert optimizers is not None
         assert pipeline is not None
+        # schedules of the fine stage count from the first step, at which its optimisers have nothing to do yet
+        warnings.filterwarnings("ignore", "Detected call of `lr_scheduler.step\\(\\)`", UserWarning)
         if not self.is_fine:
             grid = self.coarse.density_grid
             assert pipeline.datamanager.train_dataset is not None
