@@ -130,8 +130,8 @@ def _adjust(
     steps = torch.zeros(scenes, dtype=torch.long, device=problem.uv.device)
     converged = torch.zeros(scenes, dtype=torch.bool, device=problem.uv.device)
     history: dict[str, list[float]] = {"step": [], "loss": []}
-    detections = max(1, int((problem.weight[0] > 0).sum()))
-    for step in range(1, config.iterations + 1):
+    detections = max(1, int((problem.weight[:1] > 0).sum()))
+    for step in range(1, config.iterations + 1 if scenes else 1):
         search, done = _iterate(problem, search, counts, config)
         steps[search.scene] = step
         if search.scene[0] == 0:
@@ -217,7 +217,7 @@ def _next_phase(
     rounds = search.rounds + settled
     done = (settled & ~robust & ~loose & (again == inlier).all(2).all(1)) | (rounds >= _ROUNDS)
     phase = torch.where(settled, torch.where(loose, _ROBUST, _TRIMMED), search.phase)
-    sigma = torch.where(settled & ~done & (loose | ~robust), spread, sigma)
+    sigma = torch.where(settled & (loose | ~robust), spread, sigma)
     return replace(search, phase=phase, rounds=rounds), sigma, done
 
 
@@ -254,14 +254,11 @@ def _irls_weight(search: _Search, config: LmConfig) -> Float[Tensor, "b n j"]:
     norm, sigma = search.residual.norm, search.sigma[:, None, None]
     match config.loss:
         case "cauchy":
-            robust = search.phase == _ROBUST
-            # while all scenes are in the same phase, as a single one is, only that phase's weight is computed
-            weight = None if robust.all() else (norm <= _TRIM_SIGMAS * sigma).to(norm.dtype)
-            if robust.any():
-                graduated = 1 / (1 + (norm / (_CAUCHY_SIGMAS * sigma)).square())
-                weight = graduated if weight is None else torch.where(robust[:, None, None], graduated, weight)
-            assert weight is not None
-            return weight
+            return _by_phase(
+                search.phase,
+                lambda: (norm * (1 / (_CAUCHY_SIGMAS * sigma))).square_().add_(1.0).reciprocal_(),
+                lambda: (norm <= _TRIM_SIGMAS * sigma).to(norm.dtype),
+            )
         case "huber":
             return (_HUBER_SIGMAS * sigma / norm.clamp_min(1e-12)).clamp(max=1.0)
         case "none":
@@ -276,13 +273,12 @@ def _cost(problem: Problem, search: _Search, config: LmConfig) -> Float[Tensor, 
     square = norm.square()
     match config.loss:
         case "cauchy":
-            robust = search.phase == _ROBUST
-            value = None if robust.all() else torch.minimum(square, (_TRIM_SIGMAS * sigma).square()[:, None, None])
-            if robust.any():
-                scale = (_CAUCHY_SIGMAS * sigma).square()[:, None, None]
-                graduated = torch.log1p(square / scale).mul_(scale)
-                value = graduated if value is None else torch.where(robust[:, None, None], graduated, value)
-            assert value is not None
+            scale = sigma.square()[:, None, None]
+            value = _by_phase(
+                search.phase,
+                lambda: torch.log1p(square / (_CAUCHY_SIGMAS**2 * scale)).mul_(_CAUCHY_SIGMAS**2 * scale),
+                lambda: torch.minimum(square, _TRIM_SIGMAS**2 * scale),
+            )
         case "huber":
             knee = _HUBER_SIGMAS * sigma[:, None, None]
             value = torch.where(norm <= knee, square, 2 * knee * norm - knee.square())
@@ -294,12 +290,22 @@ def _cost(problem: Problem, search: _Search, config: LmConfig) -> Float[Tensor, 
     if problem.shape is not None and not problem.points_known:
         surprise, size = search.residual.surprise, search.residual.pull.shape[1]
         freedom = problem.shape.freedom
-        tail = size + (freedom + size) * ((freedom + surprise.clamp_min(size)) / (freedom + size)).log()
-        cost = cost + sigma.square() * torch.where(surprise <= size, surprise, tail)
+        tail = ((freedom + surprise).clamp_min(freedom + size) / (freedom + size)).log_().mul_(freedom + size)
+        cost = cost + sigma.square() * (surprise.clamp(max=size) + tail)
     if problem.orbit is not None:
         error = orbit_error(problem.orbit, search.state).square().sum(-1) / problem.orbit.sigma.square()
         cost = cost + sigma.square() * error.sum(1)
     return cost
+
+
+def _by_phase(
+    phase: Int[Tensor, "b"], robust: Callable[[], Tensor], trimmed: Callable[[], Tensor]
+) -> Float[Tensor, "b n j"]:
+    """What each scene's phase calls for; while all are in one phase, as a single scene is, nothing else is computed."""
+    phases = set(phase.tolist())
+    if len(phases) < 2:
+        return trimmed() if _TRIMMED in phases else robust()
+    return torch.where((phase == _ROBUST)[:, None, None], robust(), trimmed())
 
 
 def _shape_weight(problem: Problem, residual: Residuals) -> Float[Tensor, "b"]:
