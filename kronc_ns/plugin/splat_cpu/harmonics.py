@@ -16,7 +16,7 @@ def harmonic_basis(degree: int, directions: Float[Tensor, "... 3"]) -> Float[Ten
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"degree of the spherical harmonics is {degree}: expected 0 to {MAX_DEGREE}")
     x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, 0.28209479177387814)]
+    basis: list[Tensor] = [torch.full_like(x, 0.28209479177387814)]
     if degree >= 1:
         basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if degree >= 2:
@@ -38,7 +38,7 @@ def harmonic_basis(degree: int, directions: Float[Tensor, "... 3"]) -> Float[Ten
         cos_4, sin_4 = x * cos_3 - y * sin_3, x * sin_3 + y * cos_3
         first, second = z * (-4.683325804901025 * zz + 2.007139630671868), 3.31161143515146 * zz - 0.47308734787878004
         basis += [0.6258357354491761 * sin_4, -1.7701307697799304 * z * sin_3, second * sin_2, first * y]
-        basis += [zz * (3.7024941420321507 * zz - 3.1735664074561294) + 0.31735664074561293]
+        basis += [3.7024941420321507 * torch.square(zz) - 3.1735664074561294 * zz + 0.31735664074561293]
         basis += [first * x, second * cos_2, -1.7701307697799304 * z * cos_3, 0.6258357354491761 * cos_4]
     return torch.stack(basis, dim=-1)
 

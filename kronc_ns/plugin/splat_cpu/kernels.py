@@ -4,10 +4,12 @@
 for a CPU: within a tile the Gaussians come one after the other, front to back, and each works on whole rows of the
 tile at once. A pixel meets the same Gaussians in the same order as on a GPU. The loops over x have a fixed length and
 no branches, so that they compile to vector instructions; for that the constants are single precision, too.
+All of it stands in one file because numba's cache on disk notices changes of a function's own file only.
 
 Arrays are flat over cameras: M = cameras x Gaussians, K = (tile, Gaussian) pairs, T = cameras x tiles.
 """
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -39,16 +41,17 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., An
     """``numba.njit``, kept on disk where numba finds a folder it may write to, else compiled in every process."""
 
     def compile_it(function: Callable[..., Any]) -> Callable[..., Any]:
-        try:
-            return numba.njit(cache=True, fastmath=_FASTMATH, error_model="numpy", **options)(function)
-        except RuntimeError:  # neither __pycache__ nor the user's cache nor NUMBA_CACHE_DIR can be written to
-            return numba.njit(fastmath=_FASTMATH, error_model="numpy", **options)(function)
+        # error_model: a division that may raise ends the vector instructions
+        compiled = numba.njit(fastmath=_FASTMATH, error_model="numpy", nogil=True, **options)(function)
+        with contextlib.suppress(RuntimeError):  # neither __pycache__ nor the user's cache nor NUMBA_CACHE_DIR
+            compiled.enable_caching()
+        return compiled
 
     return compile_it
 
 
 @_compiled()
-def _falloff(sigma: float) -> float:
+def _falloff(sigma: Any) -> Any:
     """exp(-sigma) for sigma in [0, REACH], from products only: a call of ``exp`` would end the vector instructions."""
     u = min(sigma, REACH) * EIGHTH - MIDDLE
     e = C0 + u * (C1 + u * (C2 + u * (C3 + u * (C4 + u * (C5 + u * (C6 + u * C7))))))
@@ -58,15 +61,19 @@ def _falloff(sigma: float) -> float:
 
 
 @_compiled()
-def _rows(centre: float, a: float, b: float, c: float, opacity: float, low: int, high: int) -> tuple[int, int]:
-    """Rows within [low, high) that the ellipse ``alpha >= ALPHA_MIN`` reaches, at most one too many on either side."""
+def _rows(mx: float, my: float, a: float, b: float, c: float, opacity: float, height: int) -> tuple[int, int]:
+    """First row and last row + 1 of a tile that the ellipse ``alpha >= ALPHA_MIN`` reaches, at most one too many.
+
+    ``mx`` and ``my`` count from the tile's corner, of which ``height`` rows lie in the image.
+    """
     determinant = a * c - b * b
     if not (determinant > 0 and a > 0):  # not an ellipse: rounding spoilt the covariance
-        return low, high
-    half = math.sqrt(2 * math.log(opacity / ALPHA_MIN) * a / determinant)
-    first = max(float(low), math.floor(centre - half - 0.5))
-    last = min(float(high), math.ceil(centre + half + 0.5))
-    return int(first), int(last)
+        return 0, height
+    scale = 2 * math.log(opacity / ALPHA_MIN) / determinant
+    half_x, half_y = math.sqrt(scale * c), math.sqrt(scale * a)
+    if mx + half_x < 0 or mx - half_x > TILE:
+        return 0, 0
+    return int(max(0.0, math.floor(my - half_y - 0.5))), int(min(float(height), math.ceil(my + half_y + 0.5)))
 
 
 @_compiled()
@@ -77,7 +84,7 @@ def _workspace(channels: int, height: int, width: int, dtype: Any) -> np.ndarray
         for x in range(TILE):
             work[PASSED, y, x] = ONE
             work[OPEN, y, x] = ONE if (y < height) & (x < width) else ZERO
-            work[COLUMN, y, x] = x
+            work[COLUMN, y, x] = x + 0.5
     return work
 
 
@@ -119,16 +126,21 @@ def _composite_tile(
         opacity = opacities[i]
         if not opacity >= ALPHA_MIN:
             continue
-        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
-        first, last = _rows(means2d[i, 1], a, b, c, opacity, top, bottom)
-        start = means2d[i, 0] - kind(left + 0.5)
-        for y in range(first - top, last - top):
+        mx, my, a, b, c = (
+            means2d[i, 0] - kind(left),
+            means2d[i, 1] - kind(top),
+            conics[i, 0],
+            conics[i, 1],
+            conics[i, 2],
+        )
+        first, last = _rows(mx, my, a, b, c, opacity, bottom - top)
+        for y in range(first, last):
             if not row_open[y]:
                 continue
-            dy = means2d[i, 1] - kind(y + top + 0.5)
+            dy = my - kind(y + 0.5)
             slope, base = b * dy, HALF * c * dy * dy
             for x in range(TILE):
-                dx = start - work[COLUMN, y, x]
+                dx = mx - work[COLUMN, y, x]
                 sigma = (HALF * a * dx + slope) * dx + base
                 alpha = min(ALPHA_MAX, opacity * _falloff(sigma))
                 before = work[PASSED, y, x]
@@ -139,8 +151,9 @@ def _composite_tile(
                 work[PASSED, y, x] = after if drawn else before
                 work[OPEN, y, x] = ZERO if hit & (not drawn) else work[OPEN, y, x]
             for d in range(channels):
+                color = colors[i, d]
                 for x in range(TILE):
-                    work[PLANES + d, y, x] += work[WEIGHT, y, x] * colors[i, d]
+                    work[PLANES + d, y, x] += work[WEIGHT, y, x] * color
     for y in range(bottom - top):
         for x in range(right - left):
             transmittance[top + y, left + x] = work[PASSED, y, x]
@@ -207,27 +220,35 @@ def _differentiate_tile(
     for k in range(len(gaussians)):
         if k % RECOUNT == 0 and not _any_open(work, row_open):
             break
-        i, v = gaussians[k], numbers[k]
+        i = gaussians[k]
         opacity = opacities[i]
         if not opacity >= ALPHA_MIN:
             continue
-        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
-        first, last = _rows(means2d[i, 1], a, b, c, opacity, top, bottom)
-        start = means2d[i, 0] - kind(left + 0.5)
-        for y in range(first - top, last - top):
+        mx, my, a, b, c = (
+            means2d[i, 0] - kind(left),
+            means2d[i, 1] - kind(top),
+            conics[i, 0],
+            conics[i, 1],
+            conics[i, 2],
+        )
+        first, last = _rows(mx, my, a, b, c, opacity, bottom - top)
+        v = v_pairs[numbers[k]]
+        v_x, v_y, v_x_abs, v_y_abs, v_a, v_b, v_c, v_opacity = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+        for y in range(first, last):
             if not row_open[y]:
                 continue
-            dy = means2d[i, 1] - kind(y + top + 0.5)
-            slope, base = b * dy, HALF * c * dy * dy
+            dy = my - kind(y + 0.5)
+            slope, base, c_dy = b * dy, HALF * c * dy * dy, c * dy
             for x in range(TILE):
                 work[ALONG, y, x] = ZERO
             for d in range(channels):
+                color = colors[i, d]
                 for x in range(TILE):
-                    work[ALONG, y, x] += colors[i, d] * work[PLANES + d, y, x]
+                    work[ALONG, y, x] += color * work[PLANES + d, y, x]
             # sums over the row of v_sigma, v_sigma dx, v_sigma dx^2 and of the absolute gradients of the centre
             sum_0, sum_1, sum_2, sum_x, sum_y = ZERO, ZERO, ZERO, ZERO, ZERO
             for x in range(TILE):
-                dx = start - work[COLUMN, y, x]
+                dx = mx - work[COLUMN, y, x]
                 sigma = (HALF * a * dx + slope) * dx + base
                 full = opacity * _falloff(sigma)
                 alpha = min(ALPHA_MAX, full)
@@ -235,32 +256,33 @@ def _differentiate_tile(
                 after = before * (ONE - alpha)
                 hit = (sigma >= ZERO) & (sigma < REACH) & (alpha >= ALPHA_MIN) & (work[OPEN, y, x] > ZERO)
                 drawn = hit & (after > TRANSMITTANCE_MIN)
-                share = alpha * before if drawn else ZERO
-                rest = work[BEHIND, y, x] - share * work[ALONG, y, x]
-                v_sigma = alpha * (rest / (ONE - alpha) - before * work[ALONG, y, x])
+                weight = alpha * before if drawn else ZERO
+                behind = work[BEHIND, y, x] - weight * work[ALONG, y, x]
+                v_sigma = alpha * (behind / (ONE - alpha) - before * work[ALONG, y, x])
                 v_sigma = v_sigma if drawn & (full <= ALPHA_MAX) else ZERO  # clamped: only the colour matters
-                work[WEIGHT, y, x] = share
-                work[BEHIND, y, x] = rest
+                work[WEIGHT, y, x] = weight
+                work[BEHIND, y, x] = behind
                 work[PASSED, y, x] = after if drawn else before
                 work[OPEN, y, x] = ZERO if hit & (not drawn) else work[OPEN, y, x]
                 sum_0 += v_sigma
                 sum_1 += v_sigma * dx
                 sum_2 += v_sigma * dx * dx
                 sum_x += abs(v_sigma * (a * dx + slope))
-                sum_y += abs(v_sigma * (b * dx + c * dy))
-            v_pairs[v, 0] += a * sum_1 + slope * sum_0
-            v_pairs[v, 1] += b * sum_1 + c * dy * sum_0
-            v_pairs[v, 2] += sum_x
-            v_pairs[v, 3] += sum_y
-            v_pairs[v, 4] += HALF * sum_2
-            v_pairs[v, 5] += dy * sum_1
-            v_pairs[v, 6] += HALF * dy * dy * sum_0
-            v_pairs[v, 7] -= sum_0 / opacity
+                sum_y += abs(v_sigma * (b * dx + c_dy))
+            v_x += a * sum_1 + slope * sum_0
+            v_y += b * sum_1 + c_dy * sum_0
+            v_x_abs += sum_x
+            v_y_abs += sum_y
+            v_a += HALF * sum_2
+            v_b += dy * sum_1
+            v_c += HALF * dy * dy * sum_0
+            v_opacity -= sum_0 / opacity
             for d in range(channels):
-                total = ZERO
+                v_color = ZERO
                 for x in range(TILE):
-                    total += work[WEIGHT, y, x] * work[PLANES + d, y, x]
-                v_pairs[v, 8 + d] += total
+                    v_color += work[WEIGHT, y, x] * work[PLANES + d, y, x]
+                v[8 + d] += v_color
+        v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7] = v_x, v_y, v_x_abs, v_y_abs, v_a, v_b, v_c, v_opacity
 
 
 @_compiled(parallel=True)

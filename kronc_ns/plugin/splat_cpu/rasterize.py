@@ -41,30 +41,28 @@ class RasterizeToPixels(torch.autograd.Function):
         with _KERNELS:
             order = tiles.schedule(_use_as_many_threads_as_torch())
             kernels.rasterize_forward(*inputs, _array(backgrounds), *lists, order, tiles.across, render, transmittance)
-        ctx.save_for_backward(means2d, conics, colors, opacities, backgrounds)
+        ctx.save_for_backward(means2d)
         ctx.kept = (inputs, tiles, render, transmittance, absgrad)
-        return torch.from_numpy(render).to(colors.dtype), torch.from_numpy(1 - transmittance[..., None]).to(
-            colors.dtype
-        )
+        return torch.from_numpy(render), torch.from_numpy(1 - transmittance[..., None])
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of the five tensors."""
         from kronc_ns.plugin.splat_cpu import kernels
 
-        means2d, conics, colors, opacities, backgrounds = ctx.saved_tensors
+        (means2d,) = ctx.saved_tensors
         inputs, tiles, render, transmittance, absgrad = ctx.kept
         v_render = gradients[0].contiguous().numpy()
         v_alpha = gradients[1][..., 0].contiguous().numpy()
-        v_pairs = np.zeros((len(tiles.gaussians), 8 + colors.shape[-1]), render.dtype)
-        v_gaussians = np.zeros((len(tiles.order), 8 + colors.shape[-1]), render.dtype)
+        v_pairs = np.zeros((len(tiles.gaussians), 8 + render.shape[-1]), render.dtype)
+        v_gaussians = np.zeros((len(tiles.order), 8 + render.shape[-1]), render.dtype)
         lists = (tiles.gaussians, tiles.offsets, tiles.numbers)
         with _KERNELS:
             order = tiles.schedule(_use_as_many_threads_as_torch())
             grid = (order, tiles.across)
             kernels.rasterize_backward(*inputs, *lists, *grid, render, transmittance, v_render, v_alpha, v_pairs)
             kernels.sum_over_tiles(v_pairs, tiles.starts, tiles.order, v_gaussians)
-        v = torch.from_numpy(v_gaussians).reshape(*opacities.shape, -1)
+        v = torch.from_numpy(v_gaussians).reshape(*means2d.shape[:2], -1)
         if absgrad:
             means2d.absgrad = v[..., 2:4]
         v_backgrounds = np.einsum("chw,chwd->cd", transmittance, v_render)
@@ -106,6 +104,9 @@ def _array(tensor: Tensor) -> np.ndarray:
 def _use_as_many_threads_as_torch() -> int:
     import numba
 
-    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)  # pyright: ignore[reportAttributeAccessIssue]
-    numba.set_num_threads(threads)
-    return threads
+    threads = torch.get_num_threads()
+    workers = min(threads, numba.config.NUMBA_NUM_THREADS)  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
+    numba.set_num_threads(workers)
+    if torch.get_num_threads() != threads:  # when numba starts its threads it sets OpenMP's number, which is torch's
+        torch.set_num_threads(threads)
+    return workers

@@ -21,7 +21,7 @@ def rasterization(
     opacities: Float[Tensor, " n"],
     colors: Float[Tensor, "..."],
     viewmats: Float[Tensor, "c 4 4"],
-    Ks: Float[Tensor, "c 3 3"],  # noqa: N803 (gsplat's name)
+    Ks: Float[Tensor, "c 3 3"],  # gsplat's name
     width: int,
     height: int,
     near_plane: float = 0.01,
