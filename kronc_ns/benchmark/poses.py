@@ -1,4 +1,4 @@
-"""Pose accuracy on synthetic captures: the paper's noise model and the walk from the circle."""
+"""Accuracy of the paper's solver on synthetic captures: its noise model, and the walk from the circle."""
 
 import math
 from dataclasses import dataclass
@@ -56,7 +56,8 @@ def measure(setting: Setting, seed: int) -> dict[str, Any]:
         given = noisy_poses(capture.c2w, *setting.pose_noise, torch.Generator().manual_seed(seed))
     scene = capture_scene(capture, given)
     reference = dict(zip(scene.names, capture.c2w, strict=True))
-    figures = _figures(scene, load_config(setting.config, seed=seed), reference)
+    init = "circular" if setting.pose_noise is None else "given"
+    figures = _figures(scene, load_config(setting.config, seed=seed, solver="adam", init=init), reference)
     if setting.noise_px:
         points = capture.points
         best = maximum_likelihood(scene, capture.c2w, points, robust=setting.outliers > 0)
