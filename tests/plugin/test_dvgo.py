@@ -9,6 +9,7 @@ import torch
 pytestmark = pytest.mark.nerfstudio
 pytest.importorskip("nerfstudio")
 
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig  # noqa: E402
 from nerfstudio.cameras.cameras import Cameras  # noqa: E402
 from nerfstudio.cameras.rays import RayBundle  # noqa: E402
 from nerfstudio.data.scene_box import SceneBox  # noqa: E402
@@ -383,6 +384,22 @@ def test_an_empty_coarse_stage_ends_with_its_reason(capsys):
         run.step(0)
     assert ended.value.code == 2
     assert "found nothing in the scene box" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_poses_can_be_refined(fine):
+    model = tiny_model(camera_optimizer=CameraOptimizerConfig(mode="SO3xR3"))
+    grid = model.coarse.density_grid
+    grid.values.data = 14 * (2 - grid.nodes().norm(dim=-1, keepdim=True) / RADIUS)
+    if fine:
+        model.begin_fine(voxels=2000)
+    view = torch.arange(8).repeat_interleave(64)[:, None]
+    rays = ring(8).generate_rays(view, coords=12 + 8 * torch.rand(512, 2) - 4)
+    losses = model.train().get_loss_dict(model(rays), {"image": torch.zeros(512, 3)})
+    sum(losses.values()).backward()
+    gradient = model.camera_optimizer.pose_adjustment.grad
+    assert torch.isfinite(gradient).all()
+    assert gradient.norm(dim=-1).min() > 0
 
 
 def test_total_variation_is_an_option():
