@@ -192,4 +192,4 @@ def misfit(attempt: Attempt) -> float:
     error = (objective.reproject(start.points, start.c2w, scene.camera) - scene.uv).norm(dim=-1)
     off = (1 - 1 / (1 + (error / tolerance).square())).nan_to_num(1.0)
     lost = ~in_front(start) | far_side(start) | ~start.used[:, None]
-    return float(torch.where(lost, 1.0, off)[counted].mean())
+    return float(torch.where(lost, 1.0, off)[counted].mean()) if counted.any() else 1.0

@@ -88,7 +88,8 @@ class SolverOptions:
 
     def any_solver_option(self) -> bool:
         """Whether any option was given, so that an existing solution may not be what is wanted."""
-        return any(getattr(self, f.name) not in (None, False) for f in fields(SolverOptions))
+        given = (getattr(self, f.name) for f in fields(SolverOptions))
+        return any(value is not None and value is not False for value in given)
 
 
 def _update(target: Any, content: Any, where: str) -> Any:

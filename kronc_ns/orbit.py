@@ -90,7 +90,7 @@ def _leave_out_error(index: Float[Tensor, "k"], c2w: Float[Tensor, "k 3 4"], gap
     """Root mean square error (degrees, metres) at the middle of a bridged gap ``gap`` indices wide."""
     rotation, distance = [], []
     hidden = max(1, min(gap - 1, len(index) - 3))
-    for first in range(1, len(index) - hidden, max(1, (len(index) - hidden) // 24)):
+    for first in range(1, len(index) - hidden, max(1, (len(index) - hidden) // 8)):
         kept = torch.ones(len(index), dtype=torch.bool)
         kept[first : first + hidden] = False
         middle = first + hidden // 2

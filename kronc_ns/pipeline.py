@@ -5,6 +5,7 @@ import json
 import math
 import os
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
@@ -34,6 +35,8 @@ from kronc_ns.verify import Evidence, verify
 
 _FORMAT = 2  # raised whenever the same input and options give another solution
 _TOGETHER = 4  # scenes that go through the stages together
+_CONTRADICTED = 0.5  # of the mean distance from their middle: given centres that are off by more are no use
+_PROMISING = 2  # of the circles, those whose odd views are located anew
 _GOOD_SHARE = 0.9  # views that agree, from which on no other start is tried
 _GOOD_SIGMA = 0.004  # of the image diagonal: noise of a fit that is believed at once
 
@@ -148,10 +151,19 @@ def _lm(scenes: Sequence[Scene], config: KroncConfig, progress: Callable[[int, f
             if rank < len(tier) and not any(_good(attempt, scenes[i]) for attempt in tried[i])
             for start in tier[rank]()
         ]
-        attempts = repair(adjust_starts([start for _, start in starts], config, progress), config)
+        attempts = adjust_starts([start for _, start in starts], config, progress)
+        fresh: dict[int, list[Attempt]] = defaultdict(list)
         for (i, _), attempt in zip(starts, attempts, strict=True):
+            fresh[i].append(attempt)
+        promising = [(i, attempt) for i, new in fresh.items() for attempt in _promising(new)]
+        repaired = repair([attempt for _, attempt in promising], config)
+        for (i, _), attempt in zip(promising, repaired, strict=True):
             tried[i].append(attempt)
     return [_best(attempts) for attempts in tried]
+
+
+def _promising(attempts: Sequence[Attempt]) -> Sequence[Attempt]:
+    return attempts if len(attempts) <= _PROMISING else sorted(attempts, key=misfit)[:_PROMISING]
 
 
 def _best(attempts: Sequence[Attempt]) -> Attempt:
@@ -301,7 +313,7 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig) -> Solution:
 def _placement(
     scene: Scene, attempt: Attempt, points: Float[Tensor, "j 3"], posed: Bool[Tensor, "n"], config: KroncConfig
 ) -> Similarity:
-    """The gauge. Given poses keep their frame; otherwise a car stands in its own axes and metres (see `frame`).
+    """The gauge. Given poses that fit keep their frame; else a car stands in its own axes and metres (see `frame`).
 
     A known length of the car sets the scale in either case.
     """
@@ -313,12 +325,14 @@ def _placement(
     in_car_frame = identity
     if template is not None and config.solver == "adam":
         in_car_frame = template_frame(points, template)
+    placement = in_car_frame if template is not None else standing(scene.schema, points, c2w, config.radius_m)
     if attempt.start.name == "given":
-        placement = umeyama(c2w[..., 3], _given(scene)[posed][..., 3])
-    elif template is not None:
-        placement = in_car_frame
-    else:
-        placement = standing(scene.schema, points, c2w, config.radius_m)
+        given = _given(scene)[posed][..., 3]
+        kept = umeyama(c2w[..., 3], given)
+        off = (kept.apply(c2w[..., 3]) - given).norm(dim=-1).median()
+        # poses that the solution contradicts have no frame to keep
+        if off <= _CONTRADICTED * (given - given.mean(0)).norm(dim=-1).mean():
+            placement = kept
     if config.car_length_m is None or template is None:
         return placement
     length = template.length_m(in_car_frame.apply(points)) * placement.scale / in_car_frame.scale

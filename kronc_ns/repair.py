@@ -17,6 +17,7 @@ from kronc_ns.starts import LOST, TOLERANCE_SIGMAS, Start, far_side, in_front, l
 
 _ODD_SHARE = 0.3  # share of a view's detections on the far side of the car that makes the view suspect
 _REPAIRS = 3
+_HOPELESS = 0.02  # of the image diagonal: with such noise the points are no points to locate a view against
 
 
 def repair(attempts: Sequence[Attempt], config: KroncConfig) -> list[Attempt]:
@@ -47,8 +48,10 @@ def repair(attempts: Sequence[Attempt], config: KroncConfig) -> list[Attempt]:
 
 
 def _suspects(attempt: Attempt) -> Bool[Tensor, "n"]:
-    start = attempt.start
+    start, camera = attempt.start, attempt.start.scene.camera
     seen = start.scene.visibility > 0
+    if attempt.sigma_px > _HOPELESS * math.hypot(camera.width, camera.height):
+        return torch.zeros(len(seen), dtype=torch.bool)
     away = (far_side(start) & seen).sum(1) > _ODD_SHARE * seen.sum(1)
     few = 2 * attempt.inlier.sum(1) < seen.sum(1)
     return usable_views(start.scene) & (~attempt.agreeing | few | away)

@@ -126,6 +126,8 @@ def _judge(
     share = median_px / math.hypot(scene.camera.width, scene.camera.height)
     count, views = int(solved.sum()), len(scene)
     fit = f"median reprojection error {median_px:.2f} px ({100 * share:.2f} % of the image diagonal)"
+    if not math.isfinite(median_px):
+        fit = "no detection meets a solved point"
     if count == 0 or (count < MIN_VIEWS and evidence.shape_weight is None):
         return Status.FAILED, f"{count} of {views} views agree with each other, expected at least {MIN_VIEWS}; {fit}"
     if share > POOR_FIT:

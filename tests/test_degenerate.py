@@ -21,6 +21,8 @@ from kronc_ns.solve.solution import Solution, Status, ViewStatus
 from kronc_ns.synthetic.scenes import make_capture
 from tests.conftest import scene_of
 
+pytestmark = pytest.mark.slow
+
 VIEWS = 9
 CAPTURE = make_capture("walk", views=VIEWS, seed=7, noise_px=0.5)
 PLAIN = KeypointSchema("things-66", tuple(f"thing {j}" for j in range(66)), tuple(range(66)))
@@ -137,7 +139,6 @@ def test_trouble_from_one_start_ends_in_a_status(trouble, schema, init, tmp_path
     assert_says_what_it_is(solution, trouble, scene, tmp_path / "out")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("trouble", KEYPOINTS)
 @pytest.mark.parametrize("schema", [APOLLOCAR3D_66, PLAIN])
 def test_trouble_from_every_start_ends_in_a_status(trouble, schema, tmp_path):
@@ -145,7 +146,6 @@ def test_trouble_from_every_start_ends_in_a_status(trouble, schema, tmp_path):
     assert_says_what_it_is(solve_scene(scene), trouble, scene, tmp_path / "out")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("trouble", KEYPOINTS)
 @pytest.mark.parametrize("options", [{"refine_focal": True, "refine_k1": True}, {"min_status": "solved"}])
 def test_trouble_with_options_ends_in_a_status(trouble, options, tmp_path):
