@@ -169,7 +169,7 @@ kronc_dvgo_cpu = MethodSpecification(
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
         steps_per_save=400,
-        max_num_iterations=1400,
+        max_num_iterations=1300,
         mixed_precision=False,
         pipeline=VanillaPipelineConfig(
             datamanager=VanillaDataManagerConfig(
@@ -178,15 +178,15 @@ kronc_dvgo_cpu = MethodSpecification(
                 eval_num_rays_per_batch=1024,
             ),
             model=DVGOModelConfig(
-                coarse_iterations=250,
-                coarse_voxels=40**3,
-                fine_voxels=74**3,
+                coarse_iterations=200,
+                coarse_voxels=32**3,
+                fine_voxels=67**3,
                 growth_steps=(200, 400),
                 mlp_width=64,
                 eval_num_rays_per_chunk=4096,
             ),
         ),
-        optimizers=_dvgo_optimizers(250, 1150, grids=0.3, mlp=3e-3, decay=0.1 ** (1 / 1150)),
+        optimizers=_dvgo_optimizers(200, 1100, grids=0.3, mlp=3e-3, decay=0.1 ** (1 / 1100)),
         viewer=ViewerConfig(quit_on_train_completion=True),
         machine=MachineConfig(device_type="cpu"),
         vis="tensorboard",
