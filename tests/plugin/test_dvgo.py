@@ -28,7 +28,8 @@ from kronc_ns.plugin.dvgo.grid import (  # noqa: E402
     sample_corners,
     sample_fused,
 )
-from kronc_ns.plugin.dvgo.model import DVGOModel, DVGOModelConfig, StageLosses  # noqa: E402
+from kronc_ns.plugin.dvgo.losses import StageLosses  # noqa: E402
+from kronc_ns.plugin.dvgo.model import DVGOModel, DVGOModelConfig  # noqa: E402
 from kronc_ns.plugin.dvgo.sampling import ray_box, sample_rays  # noqa: E402
 from kronc_ns.plugin.methods import kronc_dvgo_cpu  # noqa: E402
 from kronc_ns.synthetic.folder import write_capture  # noqa: E402

@@ -26,19 +26,8 @@ from kronc_ns.errors import KroncError
 from kronc_ns.plugin.dvgo import equations
 from kronc_ns.plugin.dvgo.field import CoarseField, DensityGridField, FineField, view_rates
 from kronc_ns.plugin.dvgo.grid import UnknownSpace
+from kronc_ns.plugin.dvgo.losses import StageLosses, beside_photometric
 from kronc_ns.plugin.dvgo.sampling import sample_rays
-
-
-@dataclass
-class StageLosses:
-    """Weights of the losses beside the photometric one, whose weight is 1."""
-
-    point_colour: float
-    """Of every sample's own colour against the pixel's (equation 10)."""
-    background_entropy: float
-    """Of the background's entropy: rays should see all of it or nothing."""
-    total_variation: float = 0.0
-    """Of the squared differences of neighbouring raw densities; an option, not in the paper."""
 
 
 @dataclass
@@ -243,15 +232,7 @@ class DVGOModel(Model):
         losses = {"rgb_loss": (predicted - image).square().sum(-1).mean()}
         if self.training:
             weight = self.config.fine_losses if self.is_fine else self.config.coarse_losses
-            off = (outputs["point_rgb"] - image[outputs["point_rays"]]).square().sum(-1, keepdim=True)
-            # weights held: the loss teaches colours, or it would be least where there is nothing at all
-            point = (outputs["point_weights"].detach() * off).sum() / len(image)
-            losses["point_rgb_loss"] = weight.point_colour * point
-            entropy = equations.background_entropy(outputs["background"])
-            losses["background_entropy"] = weight.background_entropy * entropy
-            if weight.total_variation:
-                variation = equations.total_variation(self.field.density_grid.at_nodes())
-                losses["total_variation"] = weight.total_variation * variation
+            losses |= beside_photometric(outputs, image, self.field.density_grid, weight)
             self.camera_optimizer.get_loss_dict(losses)
         return losses
 
