@@ -10,6 +10,8 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models import splatfacto
 
+from kronc_ns.benchmark.training import add_half_size, evaluate, run, train, write_variant
+from kronc_ns.config import load_config
 from kronc_ns.plugin.compatibility import train_without_lpips_weights
 from kronc_ns.plugin.splat_cpu import kernels
 from kronc_ns.plugin.splat_cpu.harmonics import harmonic_colors
@@ -17,11 +19,14 @@ from kronc_ns.plugin.splat_cpu.model import SplatfactoCpuModelConfig
 from kronc_ns.plugin.splat_cpu.rasterize import rasterize_to_pixels
 from kronc_ns.plugin.splat_cpu.rendering import rasterization
 from kronc_ns.plugin.splat_cpu.tiles import tile_lists
+from kronc_ns.synthetic.folder import write_capture
+from kronc_ns.synthetic.scenes import default_camera, make_capture
 
 from . import splat_reference
 
 pytestmark = pytest.mark.nerfstudio
 WIDTH, HEIGHT = 50, 37  # not whole tiles
+METHOD, HALF = "kronc-splatfacto-cpu", ["--downscale-factor", "2"]
 NAMES = ("means", "quats", "scales", "opacities", "colors", "backgrounds")
 
 
@@ -232,3 +237,44 @@ def test_random_starts_need_no_seed_points(camera):
     model = config.setup(scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])), num_train_data=1)
     model.eval()
     assert model.get_outputs_for_camera(camera)["accumulation"].max() > 0
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A short training on a rendered walk that densifies, half of it at half size; its config and its data."""
+    root = tmp_path_factory.mktemp("splat")
+    capture = make_capture("walk", views=24, seed=3, camera=default_camera("walk", 320))
+    write_capture(root / "capture", capture, render=True)
+    add_half_size(root / "capture")
+    points = torch.from_numpy(capture.car.keypoints)
+    write_variant(root / "exact", root / "capture", "exact", load_config("phone_walk"), points)
+    settings = {"warmup-length": 100, "resolution-schedule": 300, "stop-split-at": 450, "sh-degree-interval": 150}
+    options = [text for name, value in settings.items() for text in (f"--pipeline.model.{name}", str(value))]
+    options += ["--max-num-iterations", "600"]
+    return train(root / "exact", METHOD, root / "runs", options, HALF), root / "exact"
+
+
+@pytest.mark.slow
+def test_training_without_cuda_densifies_and_renders_the_car(trained, tmp_path):
+    config, _ = trained
+    state = torch.load(config.parent / "nerfstudio_models" / "step-000000599.ckpt")["pipeline"]
+    count = len(state["_model.gauss_params.means"])
+    assert count != 5066  # the seed points
+    assert 500 < count < 20_000
+    results = evaluate(config, tmp_path / "renders")
+    print(count, results)
+    assert results["psnr"] > 22
+    assert len(list((tmp_path / "renders").glob("*.png"))) == 3
+
+
+@pytest.mark.slow
+def test_a_training_without_cuda_is_resumed_exported_and_rendered(trained, tmp_path):
+    config, data = trained
+    more = ["--load-dir", str(config.parent / "nerfstudio_models"), "--max-num-iterations", "10"]
+    resumed = train(data, METHOD, tmp_path, more, HALF)
+    assert (resumed.parent / "nerfstudio_models" / "step-000000609.ckpt").exists()
+    run("ns-export", "gaussian-splat", "--load-config", str(config), "--output-dir", str(tmp_path / "ply"))
+    assert (tmp_path / "ply" / "splat.ply").read_bytes().startswith(b"ply")
+    frame = ["--load-config", str(config), "--output-path", str(tmp_path / "frames"), "--output-format", "images"]
+    run("ns-render", "interpolate", *frame, "--interpolation-steps", "1", "--downscale-factor", "2")
+    assert len(list((tmp_path / "frames").rglob("*.jpg"))) > 1

@@ -37,20 +37,20 @@ C0, C1, C2, C3, C4, C5, C6, C7 = (np.float32((-1) ** n / math.factorial(n) * mat
 _FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 
 
-def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """``numba.njit``, kept on disk where numba finds a folder it may write to, else compiled in every process."""
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``numba.njit``, kept on disk where numba finds a folder it may write to, else compiled in every process.
 
-    def compile_it(function: Callable[..., Any]) -> Callable[..., Any]:
-        # error_model: a division that may raise ends the vector instructions
-        compiled = numba.njit(fastmath=_FASTMATH, error_model="numpy", nogil=True, **options)(function)
-        with contextlib.suppress(RuntimeError):  # neither __pycache__ nor the user's cache nor NUMBA_CACHE_DIR
-            compiled.enable_caching()
-        return compiled
+    Not numba's own parallel loops: their threads fight with torch's for the cores when something else runs, and with
+    GNU's OpenMP a fork after their first use ends the process. The kernels release the GIL and take shares of the work.
+    """
+    # error_model: a division that may raise ends the vector instructions
+    compiled = numba.njit(nogil=True, fastmath=_FASTMATH, error_model="numpy")(function)
+    with contextlib.suppress(RuntimeError):  # neither __pycache__ nor the user's cache nor NUMBA_CACHE_DIR
+        compiled.enable_caching()
+    return compiled
 
-    return compile_it
 
-
-@_compiled()
+@_compiled
 def _falloff(sigma: Any) -> Any:
     """exp(-sigma) for sigma in [0, REACH], from products only: a call of ``exp`` would end the vector instructions."""
     u = min(sigma, REACH) * EIGHTH - MIDDLE
@@ -60,7 +60,7 @@ def _falloff(sigma: Any) -> Any:
     return e * e
 
 
-@_compiled()
+@_compiled
 def _rows(mx: float, my: float, a: float, b: float, c: float, opacity: float, height: int) -> tuple[int, int]:
     """First row and last row + 1 of a tile that the ellipse ``alpha >= ALPHA_MIN`` reaches, at most one too many.
 
@@ -76,7 +76,7 @@ def _rows(mx: float, my: float, a: float, b: float, c: float, opacity: float, he
     return int(max(0.0, math.floor(my - half_y - 0.5))), int(min(float(height), math.ceil(my + half_y + 0.5)))
 
 
-@_compiled()
+@_compiled
 def _workspace(channels: int, height: int, width: int, dtype: Any) -> np.ndarray:
     """Planes for a tile of which ``height`` x ``width`` pixels lie in the image."""
     work = np.zeros((PLANES + channels, TILE, TILE), dtype)
@@ -88,7 +88,7 @@ def _workspace(channels: int, height: int, width: int, dtype: Any) -> np.ndarray
     return work
 
 
-@_compiled()
+@_compiled
 def _any_open(work: np.ndarray, row_open: np.ndarray) -> bool:
     """Whether a tile has open pixels left, and in ``row_open [TILE]`` which of its rows."""
     anywhere = False
@@ -101,7 +101,7 @@ def _any_open(work: np.ndarray, row_open: np.ndarray) -> bool:
     return anywhere
 
 
-@_compiled()
+@_compiled
 def _composite_tile(
     means2d: np.ndarray,
     conics: np.ndarray,
@@ -161,8 +161,9 @@ def _composite_tile(
                 render[top + y, left + x, d] = work[PLANES + d, y, x] + work[PASSED, y, x] * background[d]
 
 
-@_compiled(parallel=True)
+@_compiled
 def rasterize_forward(
+    share: np.ndarray,
     means2d: np.ndarray,
     conics: np.ndarray,
     colors: np.ndarray,
@@ -170,7 +171,6 @@ def rasterize_forward(
     backgrounds: np.ndarray,
     gaussians: np.ndarray,
     offsets: np.ndarray,
-    schedule: np.ndarray,
     across: int,
     render: np.ndarray,
     transmittance: np.ndarray,
@@ -179,18 +179,17 @@ def rasterize_forward(
 
     ``means2d [M,2]`` px, ``conics [M,3]`` (inverse 2D covariance: xx, xy, yy) 1/px^2, ``colors [M,D]``,
     ``opacities [M]``, ``backgrounds [C,D]``, ``gaussians [K]`` front to back within each tile, ``offsets [T+1]`` into
-    it, ``schedule [T]`` the order of work; fills ``render [C,H,W,D]`` and ``transmittance [C,H,W]``.
+    it; fills the tiles named in ``share`` of ``render [C,H,W,D]`` and ``transmittance [C,H,W]``.
     """
     tiles = (len(offsets) - 1) // len(render)
-    for turn in numba.prange(len(schedule)):
-        tile = schedule[turn]
+    for tile in share:
         camera, place = tile // tiles, tile % tiles
         top, left = place // across * TILE, place % across * TILE
         listed, image = gaussians[offsets[tile] : offsets[tile + 1]], (render[camera], transmittance[camera])
         _composite_tile(means2d, conics, colors, opacities, backgrounds[camera], listed, top, left, *image)
 
 
-@_compiled()
+@_compiled
 def _differentiate_tile(
     means2d: np.ndarray,
     conics: np.ndarray,
@@ -285,8 +284,9 @@ def _differentiate_tile(
         v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7] = v_x, v_y, v_x_abs, v_y_abs, v_a, v_b, v_c, v_opacity
 
 
-@_compiled(parallel=True)
+@_compiled
 def rasterize_backward(
+    share: np.ndarray,
     means2d: np.ndarray,
     conics: np.ndarray,
     colors: np.ndarray,
@@ -294,7 +294,6 @@ def rasterize_backward(
     gaussians: np.ndarray,
     offsets: np.ndarray,
     numbers: np.ndarray,
-    schedule: np.ndarray,
     across: int,
     render: np.ndarray,
     transmittance: np.ndarray,
@@ -302,7 +301,7 @@ def rasterize_backward(
     v_alpha: np.ndarray,
     v_pairs: np.ndarray,
 ) -> None:
-    """Gradients of every (tile, Gaussian) pair, walking front to back once more.
+    """Gradients of every (tile, Gaussian) pair on the tiles in ``share``, walking front to back once more.
 
     With g the gradient of a pixel's colour and R its rendered colour, background included,
     dL/dalpha_i = T_i c_i.g - (what lies behind i) / (1 - alpha_i), and what lies behind is R.g minus what has been
@@ -311,8 +310,7 @@ def rasterize_backward(
     of their absolute values over pixels (AbsGS, Ye et al. 2024), conics xx, xy, yy, opacity, colours.
     """
     tiles = (len(offsets) - 1) // len(render)
-    for turn in numba.prange(len(schedule)):
-        tile = schedule[turn]
+    for tile in share:
         camera, place = tile // tiles, tile % tiles
         top, left = place // across * TILE, place % across * TILE
         start, end = offsets[tile], offsets[tile + 1]
@@ -321,10 +319,10 @@ def rasterize_backward(
         _differentiate_tile(means2d, conics, colors, opacities, *listed, top, left, *image, *wanted)
 
 
-@_compiled(parallel=True)
+@_compiled
 def sum_over_tiles(v_pairs: np.ndarray, starts: np.ndarray, order: np.ndarray, v_gaussians: np.ndarray) -> None:
     """Add the rows ``starts[i]:starts[i+1]`` of ``v_pairs [K,F]`` into row ``order[i]`` of ``v_gaussians [M,F]``."""
-    for i in numba.prange(len(order)):
+    for i in range(len(order)):
         for row in range(starts[i], starts[i + 1]):
             for f in range(v_pairs.shape[1]):
                 v_gaussians[order[i], f] += v_pairs[row, f]

@@ -1,6 +1,7 @@
 """Gaussians on the image plane to pixels, with gradients."""
 
-import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,7 @@ from torch import Tensor
 
 from kronc_ns.plugin.splat_cpu.tiles import TileLists
 
-# The viewer renders from a thread of its own, and one of numba's threading layers aborts when entered twice.
-_KERNELS = threading.Lock()
+_SHARES = 4  # per thread: a thread that something else on the machine holds up leaves work to the others
 
 
 class RasterizeToPixels(torch.autograd.Function):
@@ -37,10 +37,8 @@ class RasterizeToPixels(torch.autograd.Function):
         cameras, _, channels = colors.shape
         render = np.empty((cameras, height, width, channels), inputs[0].dtype)
         transmittance = np.empty((cameras, height, width), inputs[0].dtype)
-        lists = (tiles.gaussians, tiles.offsets)
-        with _KERNELS:
-            order = tiles.schedule(_use_as_many_threads_as_torch())
-            kernels.rasterize_forward(*inputs, _array(backgrounds), *lists, order, tiles.across, render, transmittance)
+        lists = (tiles.gaussians, tiles.offsets, tiles.across)
+        _over_tiles(kernels.rasterize_forward, tiles, *inputs, _array(backgrounds), *lists, render, transmittance)
         ctx.save_for_backward(means2d)
         ctx.kept = (inputs, tiles, render, transmittance, absgrad)
         return torch.from_numpy(render), torch.from_numpy(1 - transmittance[..., None])
@@ -56,12 +54,10 @@ class RasterizeToPixels(torch.autograd.Function):
         v_alpha = gradients[1][..., 0].contiguous().numpy()
         v_pairs = np.zeros((len(tiles.gaussians), 8 + render.shape[-1]), render.dtype)
         v_gaussians = np.zeros((len(tiles.order), 8 + render.shape[-1]), render.dtype)
-        lists = (tiles.gaussians, tiles.offsets, tiles.numbers)
-        with _KERNELS:
-            order = tiles.schedule(_use_as_many_threads_as_torch())
-            grid = (order, tiles.across)
-            kernels.rasterize_backward(*inputs, *lists, *grid, render, transmittance, v_render, v_alpha, v_pairs)
-            kernels.sum_over_tiles(v_pairs, tiles.starts, tiles.order, v_gaussians)
+        lists = (tiles.gaussians, tiles.offsets, tiles.numbers, tiles.across)
+        images = (render, transmittance, v_render, v_alpha)
+        _over_tiles(kernels.rasterize_backward, tiles, *inputs, *lists, *images, v_pairs)
+        kernels.sum_over_tiles(v_pairs, tiles.starts, tiles.order, v_gaussians)
         v = torch.from_numpy(v_gaussians).reshape(*means2d.shape[:2], -1)
         if absgrad:
             means2d.absgrad = v[..., 2:4]
@@ -101,12 +97,13 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _use_as_many_threads_as_torch() -> int:
-    import numba
-
+def _over_tiles(kernel: Callable[..., None], tiles: TileLists, *arguments: Any) -> None:
+    """Run ``kernel`` on all tiles, on as many threads as torch uses."""
     threads = torch.get_num_threads()
-    workers = min(threads, numba.config.NUMBA_NUM_THREADS)  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
-    numba.set_num_threads(workers)
-    if torch.get_num_threads() != threads:  # when numba starts its threads it sets OpenMP's number, which is torch's
-        torch.set_num_threads(threads)
-    return workers
+    if threads == 1:
+        kernel(tiles.shares(1)[0], *arguments)
+        return
+    # threads of this call only: a pool kept for the next would not survive a fork
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(kernel, share, *arguments) for share in tiles.shares(_SHARES * threads)]:
+            done.result()

@@ -27,10 +27,10 @@ class TileLists:
     across: int
     """Tiles in a row of the image."""
 
-    def schedule(self, workers: int) -> Int[np.ndarray, " t"]:
-        """An order of work that, cut into ``workers`` equal runs of tiles, gives each about the same load."""
+    def shares(self, count: int) -> list[Int[np.ndarray, " share"]]:
+        """The tiles in ``count`` parts of about the same load."""
         heaviest_first = np.argsort(-np.diff(self.offsets), kind="stable")
-        return np.concatenate([heaviest_first[worker::workers] for worker in range(workers)])
+        return [heaviest_first[part::count] for part in range(count)]
 
 
 def tile_lists(
