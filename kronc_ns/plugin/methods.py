@@ -259,7 +259,7 @@ kronc_splatfacto_cpu = MethodSpecification(
                 num_downscales=1,
                 resolution_schedule=1000,
                 sh_degree_interval=500,
-                densify_grad_thresh=0.0016,
+                densify_grad_thresh=0.002,
                 stop_split_at=2000,
                 stop_screen_size_at=0,
             ),

@@ -12,7 +12,7 @@ from nerfstudio.models import splatfacto
 
 from kronc_ns.benchmark.training import add_half_size, evaluate, run, train, write_variant
 from kronc_ns.config import load_config
-from kronc_ns.plugin.compatibility import train_without_lpips_weights
+from kronc_ns.plugin.compatibility import allow_numpy_in_checkpoints, train_without_lpips_weights
 from kronc_ns.plugin.splat_cpu import kernels
 from kronc_ns.plugin.splat_cpu.harmonics import harmonic_colors
 from kronc_ns.plugin.splat_cpu.model import SplatfactoCpuModelConfig
@@ -257,6 +257,7 @@ def trained(tmp_path_factory):
 @pytest.mark.slow
 def test_training_without_cuda_densifies_and_renders_the_car(trained, tmp_path):
     config, _ = trained
+    allow_numpy_in_checkpoints()
     state = torch.load(config.parent / "nerfstudio_models" / "step-000000599.ckpt")["pipeline"]
     count = len(state["_model.gauss_params.means"])
     assert count != 5066  # the seed points
