@@ -17,8 +17,8 @@ from kronc_ns import objective
 from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.options import KroncConfig
-from kronc_ns.solve.bundle import Problem, ShapePrior, State
 from kronc_ns.solve.lm import LmResult, adjust
+from kronc_ns.solve.problem import Problem, ShapePrior, State
 from kronc_ns.solve.uncertainty import camera_covariance
 from kronc_ns.starts import MIN_POINTS, Start, far_side, in_front, usable_views
 

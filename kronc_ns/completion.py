@@ -10,8 +10,8 @@ from torch import Tensor
 from kronc_ns.geometry.rotations import rotation_angle_deg
 from kronc_ns.orbit import Interpolated, interpolate_walk
 from kronc_ns.scene import Scene
-from kronc_ns.solve.bundle import OrbitPrior, Problem, State
 from kronc_ns.solve.lm import LmConfig, adjust
+from kronc_ns.solve.problem import OrbitPrior, Problem, State
 from kronc_ns.solve.solution import Solution, ViewStatus
 
 _FEWEST = 2  # keypoints that correct where the walk says a view was aimed

@@ -11,9 +11,10 @@ with jaxtyping.install_import_hook(
         "kronc_ns.geometry",
         "kronc_ns.objective",
         "kronc_ns.init",
-        "kronc_ns.solve.adam",  # each by itself: solve.bundle_cpu is compiled and cannot be checked
+        "kronc_ns.solve.adam",  # each by itself: solve.lm_cpu is compiled and cannot be checked
         "kronc_ns.solve.bundle",
         "kronc_ns.solve.lm",
+        "kronc_ns.solve.problem",
         "kronc_ns.solve.resection",
         "kronc_ns.solve.solution",
         "kronc_ns.solve.uncertainty",

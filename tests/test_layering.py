@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "kronc_ns"
 LAYERS = [
-    {"errors", "files"},
+    {"errors", "files", "compiled"},
     {"geometry"},
     {"keypoints"},
     {"scene"},

@@ -3,145 +3,23 @@
 A camera moves as p -> exp(w) p + v in its own axes, a point as X -> X + d. Only the system of the point coordinates
 (and shared intrinsics) is factorised, 3J + K unknowns, so the cost grows linearly with the views. Nothing fixes the
 gauge. Derivation: docs/solver.md.
-
-Arrays of views and keypoints are planar, [B, N, component, J]: B scenes, N views, J keypoints. The unknowns of the
-reduced system are ordered (x of all points, y of all, z of all, intrinsics).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Literal, TypeVar
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from kronc_ns.geometry.rotations import so3_exp
-from kronc_ns.solve import bundle_cpu
-
-_TINY = 1e-12
-
-
-Record = TypeVar("Record", bound="Batched")
-
-
-class Batched:
-    """A dataclass of tensors (or of such dataclasses) with the scenes in front."""
-
-    def each(self: Record, function: Callable[..., Tensor], *others: Record) -> Record:
-        """``function`` of every tensor and its counterparts in ``others``."""
-        changes = {}
-        for f in fields(self):  # pyright: ignore[reportArgumentType]
-            value = getattr(self, f.name)
-            if isinstance(value, Tensor):
-                changes[f.name] = function(value, *(getattr(other, f.name) for other in others))
-            elif isinstance(value, Batched):
-                changes[f.name] = value.each(function, *(getattr(other, f.name) for other in others))
-        return replace(self, **changes)  # pyright: ignore[reportArgumentType]
-
-    def __getitem__(self: Record, scenes: Int[Tensor, "c"]) -> Record:
-        return self.each(lambda x: x[scenes])
-
-
-@dataclass(frozen=True)
-class ShapePrior:
-    """What is known of the points beforehand: about normal around a mean shape, in the world's own frame.
-
-    Arrays are in the planar order of the reduced system.
-    """
-
-    mean: Float[Tensor, "p"]
-    precision: Float[Tensor, "p p"]
-    """Inverse covariance."""
-    freedom: float = 20.0
-    """Degrees of freedom of the tail (Student t): the fewer, the sooner an unusual shape is believed."""
-
-    @staticmethod
-    def of(mean: Float[Tensor, "j 3"], precision: Float[Tensor, "p p"]) -> "ShapePrior":
-        """Prior from a mean shape and an inverse covariance in the order index = 3 * point + axis."""
-        order = torch.arange(mean.numel(), device=mean.device).view(-1, 3).T.flatten()
-        return ShapePrior(mean.T.flatten(), precision[order][:, order].contiguous())
-
-
-@dataclass(frozen=True)
-class OrbitPrior(Batched):
-    """Expected camera centres, such as those of a smooth walk."""
-
-    centre: Float[Tensor, "b n 3"]
-    sigma: Float[Tensor, "b n"]
-    """Standard deviation per axis; inf where nothing is expected."""
-
-
-@dataclass(frozen=True)
-class Problem(Batched):
-    """What a batch of scenes measured."""
-
-    uv: Float[Tensor, "b n 2 j"]
-    """Undistorted pixels less the principal point, planar."""
-    weight: Float[Tensor, "b n j"]
-    """Weight of each detection's squared error; 0: not seen."""
-    focal: Float[Tensor, "b 2"]
-    shape: ShapePrior | None = None
-    orbit: OrbitPrior | None = None
-    refine: tuple[Literal["focal", "k1"], ...] = ()
-    """Shared intrinsics that are unknown too."""
-    points_known: bool = False
-    """Whether only the cameras are sought (resection)."""
-
-
-@dataclass(frozen=True)
-class State(Batched):
-    """The unknowns of a batch of scenes."""
-
-    rotation: Float[Tensor, "b n 3 3"]
-    """World to camera."""
-    translation: Float[Tensor, "b n 3"]
-    """World to camera."""
-    points: Float[Tensor, "b j 3"]
-    intrinsics: Float[Tensor, "b k"]
-    """As far as `Problem.refine` names them: logarithm of the focal length's factor; k1."""
-
-    @property
-    def c2w(self) -> Float[Tensor, "b n 3 4"]:
-        """Camera poses."""
-        inverse = self.rotation.transpose(-1, -2)
-        return torch.cat([inverse, -inverse @ self.translation[..., None]], dim=-1)
-
-    @staticmethod
-    def of(c2w: Float[Tensor, "b n 3 4"], points: Float[Tensor, "b j 3"], unknown: int = 0) -> "State":
-        """State with the given poses and ``unknown`` intrinsics as the camera has them."""
-        rotation = c2w[..., :3].transpose(-1, -2).contiguous()
-        translation = -(rotation @ c2w[..., 3:])[..., 0]
-        return State(rotation, translation, points, points.new_zeros(len(points), unknown))
-
-
-@dataclass(frozen=True)
-class Residuals(Batched):
-    """Reprojection of every point into every view, planar."""
-
-    plane: Float[Tensor, "b n 2 j"]
-    """Normalised image coordinates before k1."""
-    inverse_z: Float[Tensor, "b n 1 j"]
-    error: Float[Tensor, "b n 2 j"]
-    """Projection minus detection in pixels; 0 where nothing is seen."""
-    norm: Float[Tensor, "b n j"]
-    """Length of the error in pixels times the root of its weight; `BEHIND_PX` behind the camera."""
-    surprise: Float[Tensor, "b"]
-    """Squared Mahalanobis distance of the points under the shape prior; 0 without one."""
-    pull: Float[Tensor, "b p"]
-    """Half its gradient by the points."""
-
-
-def focal_of(problem: Problem, state: State) -> Float[Tensor, "b 2"]:
-    """Focal length in pixels, refined or not."""
-    if "focal" in problem.refine:
-        return problem.focal * state.intrinsics[:, problem.refine.index("focal"), None].exp()
-    return problem.focal
+from kronc_ns.solve import lm_cpu
+from kronc_ns.solve.lm_cpu import BEHIND_PX, NEAR, TINY
+from kronc_ns.solve.problem import OrbitPrior, Problem, Residuals, ShapePrior, State, focal_of
 
 
 def residuals(problem: Problem, state: State) -> Residuals:
     """Reproject all points."""
-    plane, inverse_z, error, norm = (_reproject_compiled if _compiled(problem) else _reproject)(problem, state)
+    plane, inverse_z, error, norm = _reproject(problem, state)
     if problem.shape is None or problem.points_known:
         nothing = norm.new_zeros(len(norm))
         return Residuals(plane, inverse_z, error, norm, nothing, nothing[:, None])
@@ -150,25 +28,11 @@ def residuals(problem: Problem, state: State) -> Residuals:
     return Residuals(plane, inverse_z, error, norm, (pull * deviation).sum(1), pull)
 
 
-def _compiled(problem: Problem) -> bool:
-    """Whether the kernels for the CPU serve."""
-    return problem.weight.device.type == "cpu" and problem.weight.dtype == torch.float64 and not problem.refine
-
-
-def _reproject_compiled(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    b, n, _, j = problem.uv.shape
-    plane, inverse_z, error = (problem.uv.new_empty(b, n, rows, j) for rows in (2, 1, 2))
-    norm = torch.empty_like(problem.weight)
-    given = (state.rotation, state.translation, state.points, problem.uv, problem.weight, problem.focal)
-    bundle_cpu.reproject(*(x.contiguous().numpy() for x in (*given, plane, inverse_z, error, norm)))
-    return plane, inverse_z, error, norm
-
-
 def _reproject(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     camera = torch.matmul(state.rotation, state.points.transpose(-1, -2)[:, None]) + state.translation[..., None]
     z = camera[:, :, 2:]
-    behind = z < bundle_cpu.NEAR
-    inverse_z = z.clamp_min(bundle_cpu.NEAR).reciprocal()
+    behind = z < NEAR
+    inverse_z = z.clamp_min(NEAR).reciprocal()
     plane = camera[:, :, :2] * inverse_z
     image = plane
     if "k1" in problem.refine:
@@ -178,7 +42,7 @@ def _reproject(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor, 
     error = torch.addcmul(-problem.uv, image, focal_of(problem, state)[:, None, :, None])
     error.masked_fill_(behind | ~seen[:, :, None], 0.0)
     norm = error.square().sum(2).mul_(problem.weight).sqrt_()
-    norm.masked_fill_(behind[:, :, 0] & seen, bundle_cpu.BEHIND_PX)
+    norm.masked_fill_(behind[:, :, 0] & seen, BEHIND_PX)
     return plane, inverse_z, error, norm
 
 
@@ -304,27 +168,23 @@ class Reduced:
 def reduce_system(
     problem: Problem,
     state: State,
-    residual: Residuals,
     weight: Float[Tensor, "b n j"],
     variance: Float[Tensor, "b"],
     shape_weight: Float[Tensor, "b"],
     damping: Float[Tensor, "b"],
 ) -> Reduced:
     """`linearise` and `eliminate_cameras`; compiled where that serves."""
-    if problem.points_known or problem.orbit is not None or not _compiled(problem):
-        system = linearise(problem, state, residual, weight, variance, shape_weight)
+    if not problem.plain:
+        system = linearise(problem, state, residuals(problem, state), weight, variance, shape_weight)
         return eliminate_cameras(system, damping)
     b, n, _, j = problem.uv.shape
     whitener, whitened = problem.uv.new_empty(b, n, 6, 6), problem.uv.new_zeros(b, n, 6, 3 * j + 1)
-    point, product = problem.uv.new_zeros(2, b, 3 * j, 3 * j)
-    gradient, carried = problem.uv.new_zeros(2, b, 3 * j)
-    given = (state.rotation, residual.plane, residual.inverse_z, residual.error, weight * problem.weight)
-    out = (whitener, whitened, point, product, gradient, carried)
-    bundle_cpu.reduce_system(*(x.contiguous().numpy() for x in (*given, problem.focal, damping, *out)))
-    _add_shape(problem, residual, variance * shape_weight, point, gradient)
-    _fill_diagonal(point)
-    point.diagonal(dim1=-2, dim2=-1).mul_(1 + damping[:, None])
-    return Reduced(whitener, whitened.view(b, 6 * n, 3 * j + 1), point.sub_(product), carried.sub_(gradient))
+    matrix, rhs = problem.uv.new_zeros(b, 3 * j, 3 * j), problem.uv.new_empty(b, 3 * j)
+    shape = problem.shape or ShapePrior.nothing(problem.uv)
+    given = (state.rotation, state.translation, state.points, problem.uv, problem.weight, weight, problem.focal)
+    given = (*given, damping, variance * shape_weight, shape.mean, shape.precision)
+    lm_cpu.reduce_scenes(*(x.contiguous().numpy() for x in (*given, whitener, whitened, matrix, rhs)))
+    return Reduced(whitener, whitened.flatten(1, 2), matrix, rhs)
 
 
 def eliminate_cameras(system: Linearisation, damping: Float[Tensor, "b"]) -> Reduced:
@@ -348,7 +208,7 @@ def eliminate_cameras(system: Linearisation, damping: Float[Tensor, "b"]) -> Red
 def _fill_diagonal(matrix: Tensor) -> None:
     """Keep the diagonal off zero (an unseen point, an empty view): its unknowns then stay where they are."""
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    diagonal.masked_fill_(diagonal <= _TINY, 1.0)
+    diagonal.masked_fill_(diagonal <= TINY, 1.0)
 
 
 @dataclass(frozen=True)

@@ -16,29 +16,25 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from typing_extensions import assert_never
 
-from kronc_ns.solve.bundle import (
-    Batched,
-    Problem,
-    Residuals,
-    State,
-    move,
-    orbit_error,
-    reduce_system,
-    residuals,
-    solve_step,
+from kronc_ns.solve import lm_cpu
+from kronc_ns.solve.bundle import eliminate_cameras, linearise, move, orbit_error, residuals, solve_step
+from kronc_ns.solve.lm_cpu import (
+    CAUCHY_SIGMAS,
+    COARSE,
+    LEAST_DAMPING,
+    LOOSE,
+    MOST_DAMPING,
+    RAYLEIGH_MEDIAN,
+    ROBUST,
+    ROUNDS,
+    SIGMA_FLOOR_PX,
+    START_DAMPING,
+    TRIM_SIGMAS,
+    TRIMMED,
 )
+from kronc_ns.solve.problem import Batched, Problem, Residuals, ShapePrior, State
 
-_RAYLEIGH_MEDIAN = 1.1774  # median norm of 2D normal noise, in standard deviations per axis
-_CAUCHY_SIGMAS = 3.0
 _HUBER_SIGMAS = 2.0
-_TRIM_SIGMAS = 4.5  # one good detection in 25,000 lies farther out
-_SIGMA_FLOOR_PX = 0.05
-_COARSE = 1e-2  # tolerance of the graduated phase
-_LOOSE = 0.7
-_ROUNDS = 8
-_START_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e9
-
-_ROBUST, _TRIMMED = 0, 1
 
 
 @dataclass(frozen=True)
@@ -99,7 +95,42 @@ def adjust(
     """
     config = config or LmConfig()
     with torch.no_grad():
-        return _adjust(problem, start, config, progress, most_sigma_px)
+        run = _adjust_compiled if problem.plain and config.loss == "cauchy" else _adjust
+        return run(problem, start, config, progress, most_sigma_px)
+
+
+def _adjust_compiled(
+    problem: Problem,
+    start: State,
+    config: LmConfig,
+    progress: Callable[[int, float], None] | None,
+    most_sigma_px: Float[Tensor, "b"] | None,
+) -> LmResult:
+    scenes = len(problem.uv)
+    state = start.each(lambda x: x.clone(memory_format=torch.contiguous_format))
+    sigma, cost, shape_weight = problem.uv.new_empty(3, scenes)
+    steps, converged = torch.zeros(scenes, dtype=torch.long), torch.zeros(scenes, dtype=torch.bool)
+    inlier = torch.zeros(problem.weight.shape, dtype=torch.bool)
+    losses = problem.uv.new_empty(config.iterations)
+    shape = problem.shape or ShapePrior.nothing(problem.uv)
+    given = (problem.uv, problem.weight, problem.focal, _redundancy(problem))
+    most = sigma.new_full((scenes,), math.inf) if most_sigma_px is None else most_sigma_px
+    lm_cpu.adjust_scenes(
+        *(x.numpy() for x in (state.rotation, state.translation, state.points)),
+        *(x.contiguous().numpy() for x in (*given, most, shape.mean, shape.precision)),
+        shape.freedom,
+        problem.points_known,
+        config.iterations,
+        config.tolerance,
+        *(x.numpy() for x in (sigma, cost, shape_weight, steps, converged, inlier, losses)),
+    )
+    detections = max(1, int((problem.weight[:1] > 0).sum()))
+    loss = (losses[: int(steps[0]) if scenes else 0] / detections).sqrt().tolist()
+    history = {"step": [float(step) for step in range(1, len(loss) + 1)], "loss": loss}
+    if progress is not None:
+        for step, value in enumerate(loss, start=1):
+            progress(step, value)
+    return LmResult(state, cost / sigma.square(), sigma, inlier, shape_weight, steps, converged, history)
 
 
 def _adjust(
@@ -120,9 +151,9 @@ def _adjust(
         state=start,
         residual=residual,
         sigma=sigma,
-        phase=torch.full((scenes,), _ROBUST, device=problem.uv.device),
+        phase=torch.full((scenes,), ROBUST, device=problem.uv.device),
         cost=sigma.new_full((scenes,), math.inf),
-        damping=torch.full_like(sigma, _START_DAMPING),
+        damping=torch.full_like(sigma, START_DAMPING),
         rounds=torch.zeros(scenes, dtype=torch.long, device=problem.uv.device),
     )
     search = replace(search, cost=_cost(problem, search, config))
@@ -153,7 +184,7 @@ def _adjust(
         state=finished.state,
         cost=finished.cost / sigma.square(),
         sigma_px=sigma,
-        inlier=(whole.weight > 0) & (finished.residual.norm <= _TRIM_SIGMAS * sigma[:, None, None]),
+        inlier=(whole.weight > 0) & (finished.residual.norm <= TRIM_SIGMAS * sigma[:, None, None]),
         shape_weight=_shape_weight(whole, finished.residual),
         iterations=steps,
         converged=converged,
@@ -163,25 +194,24 @@ def _adjust(
 
 def _iterate(problem: Problem, search: _Search, counts: Tensor, config: LmConfig) -> tuple[_Search, Bool[Tensor, "b"]]:
     """One damped step of every scene in the batch, and which scenes are finished."""
-    reduced = reduce_system(
+    system = linearise(
         problem,
         search.state,
         search.residual,
         _irls_weight(search, config),
         search.sigma.square(),
         _shape_weight(problem, search.residual),
-        search.damping,
     )
-    trial = move(search.state, solve_step(reduced, problem.uv.shape[3]))
+    trial = move(search.state, solve_step(eliminate_cameras(system, search.damping), problem.uv.shape[3]))
     attempt = replace(search, state=trial, residual=residuals(problem, trial))
     cost = _cost(problem, attempt, config)
     better = cost < search.cost  # false for NaN
-    coarse = (search.phase == _ROBUST) & (config.loss == "cauchy")
-    still = (search.cost - cost).abs() <= torch.where(coarse, _COARSE, config.tolerance) * search.cost
-    damping = torch.where(better, search.damping / 10, search.damping * 10).clamp(min=_LEAST_DAMPING)
-    settled = still | (damping > _MOST_DAMPING)
+    coarse = (search.phase == ROBUST) & (config.loss == "cauchy")
+    still = (search.cost - cost).abs() <= torch.where(coarse, COARSE, config.tolerance) * search.cost
+    damping = torch.where(better, search.damping / 10, search.damping * 10).clamp(min=LEAST_DAMPING)
+    settled = still | (damping > MOST_DAMPING)
     search = _choose(better, replace(attempt, cost=cost), search)
-    search = replace(search, damping=damping.clamp(max=_MOST_DAMPING))
+    search = replace(search, damping=damping.clamp(max=MOST_DAMPING))
     return _anneal(problem, search, settled, counts, config)
 
 
@@ -189,7 +219,7 @@ def _anneal(
     problem: Problem, search: _Search, settled: Bool[Tensor, "b"], counts: Tensor, config: LmConfig
 ) -> tuple[_Search, Bool[Tensor, "b"]]:
     """Follow the residuals with the scale of the loss; move settled scenes to their next phase."""
-    robust = search.phase == _ROBUST
+    robust = search.phase == ROBUST
     if not (robust | settled).any():
         return search, settled
     shrunk = torch.minimum(search.sigma, _robust_sigma(problem, search.residual) * counts)
@@ -207,16 +237,16 @@ def _next_phase(
     problem: Problem, search: _Search, settled: Bool[Tensor, "b"], shrunk: Float[Tensor, "b"], counts: Tensor
 ) -> tuple[_Search, Float[Tensor, "b"], Bool[Tensor, "b"]]:
     """From the graduated loss to the trimmed squares, and to the end when the choice of inliers stands."""
-    robust, seen, norm, sigma = search.phase == _ROBUST, problem.weight > 0, search.residual.norm, search.sigma
-    inlier = seen & (norm <= _TRIM_SIGMAS * sigma[:, None, None])
+    robust, seen, norm, sigma = search.phase == ROBUST, problem.weight > 0, search.residual.norm, search.sigma
+    inlier = seen & (norm <= TRIM_SIGMAS * sigma[:, None, None])
     found = inlier.sum((1, 2)).clamp_min(1)
     spread = (torch.where(inlier, norm.square(), 0.0).sum((1, 2)) / (2 * found)).sqrt() * counts
-    spread = torch.minimum(spread.clamp_min(_SIGMA_FLOOR_PX), shrunk)
-    again = seen & (norm <= _TRIM_SIGMAS * spread[:, None, None])
-    loose = spread < _LOOSE * sigma  # the scale lags far behind the residuals: on with the robust phase
+    spread = torch.minimum(spread.clamp_min(SIGMA_FLOOR_PX), shrunk)
+    again = seen & (norm <= TRIM_SIGMAS * spread[:, None, None])
+    loose = spread < LOOSE * sigma  # the scale lags far behind the residuals: on with the robust phase
     rounds = search.rounds + settled
-    done = (settled & ~robust & ~loose & (again == inlier).all(2).all(1)) | (rounds >= _ROUNDS)
-    phase = torch.where(settled, torch.where(loose, _ROBUST, _TRIMMED), search.phase)
+    done = (settled & ~robust & ~loose & (again == inlier).all(2).all(1)) | (rounds >= ROUNDS)
+    phase = torch.where(settled, torch.where(loose, ROBUST, TRIMMED), search.phase)
     sigma = torch.where(settled & (loose | ~robust), spread, sigma)
     return replace(search, phase=phase, rounds=rounds), sigma, done
 
@@ -238,7 +268,7 @@ def _store(finished: _Search, search: _Search, chosen: Bool[Tensor, "b"]) -> _Se
 def _robust_sigma(problem: Problem, residual: Residuals) -> Float[Tensor, "b"]:
     """Noise per axis from the median of all residuals."""
     norm = torch.where(problem.weight > 0, residual.norm, math.nan).flatten(1)
-    return (norm.nanmedian(dim=1).values / _RAYLEIGH_MEDIAN).nan_to_num(1.0).clamp_min(_SIGMA_FLOOR_PX)
+    return (norm.nanmedian(dim=1).values / RAYLEIGH_MEDIAN).nan_to_num(1.0).clamp_min(SIGMA_FLOOR_PX)
 
 
 def _redundancy(problem: Problem) -> Float[Tensor, "b"]:
@@ -256,8 +286,8 @@ def _irls_weight(search: _Search, config: LmConfig) -> Float[Tensor, "b n j"]:
         case "cauchy":
             return _by_phase(
                 search.phase,
-                lambda: (norm * (1 / (_CAUCHY_SIGMAS * sigma))).square_().add_(1.0).reciprocal_(),
-                lambda: (norm <= _TRIM_SIGMAS * sigma).to(norm.dtype),
+                lambda: (norm * (1 / (CAUCHY_SIGMAS * sigma))).square_().add_(1.0).reciprocal_(),
+                lambda: (norm <= TRIM_SIGMAS * sigma).to(norm.dtype),
             )
         case "huber":
             return (_HUBER_SIGMAS * sigma / norm.clamp_min(1e-12)).clamp(max=1.0)
@@ -276,8 +306,8 @@ def _cost(problem: Problem, search: _Search, config: LmConfig) -> Float[Tensor, 
             scale = sigma.square()[:, None, None]
             value = _by_phase(
                 search.phase,
-                lambda: torch.log1p(square / (_CAUCHY_SIGMAS**2 * scale)).mul_(_CAUCHY_SIGMAS**2 * scale),
-                lambda: torch.minimum(square, _TRIM_SIGMAS**2 * scale),
+                lambda: torch.log1p(square / (CAUCHY_SIGMAS**2 * scale)).mul_(CAUCHY_SIGMAS**2 * scale),
+                lambda: torch.minimum(square, TRIM_SIGMAS**2 * scale),
             )
         case "huber":
             knee = _HUBER_SIGMAS * sigma[:, None, None]
@@ -304,8 +334,8 @@ def _by_phase(
     """What each scene's phase calls for; while all are in one phase, as a single scene is, nothing else is computed."""
     phases = set(phase.tolist())
     if len(phases) < 2:
-        return trimmed() if _TRIMMED in phases else robust()
-    return torch.where((phase == _ROBUST)[:, None, None], robust(), trimmed())
+        return trimmed() if TRIMMED in phases else robust()
+    return torch.where((phase == ROBUST)[:, None, None], robust(), trimmed())
 
 
 def _shape_weight(problem: Problem, residual: Residuals) -> Float[Tensor, "b"]:

@@ -18,8 +18,9 @@ from torch import Tensor
 
 from kronc_ns.geometry.poses import invert, look_at, make_pose
 from kronc_ns.geometry.rotations import so3_exp
-from kronc_ns.solve.bundle import Problem, State, residuals
+from kronc_ns.solve.bundle import residuals
 from kronc_ns.solve.lm import LmConfig, adjust
+from kronc_ns.solve.problem import Problem, State
 
 _AZIMUTHS = 24
 _ELEVATIONS_DEG = (-5.0, 15.0, 35.0, 60.0)

@@ -5,7 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from kronc_ns.geometry.rotations import skew
-from kronc_ns.solve.bundle import Problem, State, reduce_system, residuals
+from kronc_ns.solve.bundle import reduce_system
+from kronc_ns.solve.problem import Problem, State
 
 _DAMPING = 1e-9  # keeps the gauge's zero pivots positive
 
@@ -25,26 +26,20 @@ def camera_covariance(
     """
     b, n, _ = inlier.shape
     seen = (inlier & (problem.weight > 0)).any(1)
-    reduced = reduce_system(
-        problem,
-        state,
-        residuals(problem, state),
-        inlier.to(problem.weight.dtype),
-        sigma_px.square(),
-        shape_weight,
-        torch.full_like(sigma_px, _DAMPING),
-    )
+    weight, variance = inlier.to(problem.weight.dtype), sigma_px.square()
+    damping = torch.full_like(sigma_px, _DAMPING)
+    reduced = reduce_system(problem, state, weight, variance, shape_weight, damping)
     size = reduced.rhs.shape[1]
     gauge, motion = _gauge(state, seen, size)
     # any generalised inverse will do, since the gauge is projected out below; a stiff spring makes the matrix regular
     stiffness = reduced.matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
     matrix = reduced.matrix + stiffness * (gauge @ gauge.transpose(1, 2))
     factor = torch.linalg.cholesky_ex(matrix).L
-    # camera = -F (points), with the gauge's part of the points' error taken off points and camera alike
-    follow = -(reduced.whitener.mT @ reduced.whitened[..., :size].view(b, n, 6, size))
-    relative = follow - motion @ gauge.transpose(1, 2)[:, None]
-    spread = torch.linalg.solve_triangular(factor, relative.reshape(b, 6 * n, size).mT, upper=False)
-    spread = spread.mT.reshape(b, n, 6, size)
+    # A camera follows the points by -W^T Y, and the gauge's part of their error, motion gauge^T, is taken off it. With
+    # Z = Y L^-T and G = L^-1 gauge its covariance is W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T.
+    z = torch.linalg.solve_triangular(factor.mT, reduced.whitened[..., :size], upper=True, left=False)
+    z, g = z.view(b, n, 6, size), torch.linalg.solve_triangular(factor, gauge, upper=False)
+    spread = reduced.whitener.mT @ z + motion @ g.mT[:, None]
     own = reduced.whitener.mT @ reduced.whitener
     covariance = (own + spread @ spread.mT) * sigma_px.square()[:, None, None, None]
     # the centre moves by -v (in camera axes) when the translation grows by v

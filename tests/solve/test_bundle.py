@@ -9,10 +9,6 @@ from torch import Tensor
 from kronc_ns.geometry.rotations import skew
 from kronc_ns.solve.bundle import (
     Linearisation,
-    OrbitPrior,
-    Problem,
-    ShapePrior,
-    State,
     Step,
     eliminate_cameras,
     linearise,
@@ -22,6 +18,7 @@ from kronc_ns.solve.bundle import (
     residuals,
     solve_step,
 )
+from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State
 from tests.solve.problems import SIMILARITY, moved, randn, scene, started
 
 VIEWS, JOINTS = 4, 6
@@ -176,9 +173,10 @@ def test_the_short_cut_to_the_reduced_system_is_no_other_system(variant):
     problem, state, weight, _ = systems(variant, batch=3)
     problem.weight[0, 2], problem.weight[1, :, 4] = 0, 0
     damping = torch.tensor([1e-3, 1.0, 10.0], dtype=torch.float64)
-    ones, residual = torch.ones(3, dtype=torch.float64), residuals(problem, state)
-    arguments = (problem, state, residual, weight, VARIANCE * ones, SHAPE_WEIGHT * ones)
-    short, long = reduce_system(*arguments, damping), eliminate_cameras(linearise(*arguments), damping)
+    ones = torch.ones(3, dtype=torch.float64)
+    factors = (weight, VARIANCE * ones, SHAPE_WEIGHT * ones)
+    short = reduce_system(problem, state, *factors, damping)
+    long = eliminate_cameras(linearise(problem, state, residuals(problem, state), *factors), damping)
     for ours, theirs in zip(vars(short).values(), vars(long).values(), strict=True):
         ours, theirs = (x.tril() if x is short.matrix or x is long.matrix else x for x in (ours, theirs))
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-7)

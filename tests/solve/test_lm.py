@@ -12,8 +12,9 @@ from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.scene import Scene
-from kronc_ns.solve.bundle import OrbitPrior, Problem, ShapePrior, State, focal_of, residuals
+from kronc_ns.solve.bundle import residuals
 from kronc_ns.solve.lm import LmConfig, LmResult, adjust
+from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State, focal_of
 from tests.solve.problems import FOCAL, SIMILARITY, moved, randn, scene, started
 
 
@@ -269,3 +270,32 @@ def test_an_orbit_carries_views_that_see_nothing():
     sigma[0, 3] = 0.1
     result = adjust(replace(problem, orbit=OrbitPrior(expected, sigma)), started(truth))
     torch.testing.assert_close(result.state.c2w[0, 3, :, 3], expected[0, 3], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("variant", ["plain", "shape", "points known"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_compiled_loop_takes_the_tensors_way(variant, seed):
+    """An orbit that expects nothing keeps a problem from being compiled and changes nothing else."""
+    problem, truth = scene(10, 14, 2, noise_px=0.7, outliers=0.15, seed=10 * seed)
+    problem.weight[0, 2] = 0
+    if variant == "shape":
+        root = randn(42, 42, seed=seed)
+        problem = replace(problem, shape=ShapePrior.of(truth.points[0], root @ root.T / 14))
+    problem = replace(problem, points_known=variant == "points known")
+    start = started(truth, 8.0, 0.5, seed=seed)
+    if problem.points_known:
+        start = replace(start, points=truth.points)
+    nowhere = OrbitPrior(truth.c2w[..., 3], torch.full(problem.uv.shape[:2], torch.inf, dtype=torch.float64))
+    steps: list[tuple[int, float]] = []
+    ours = adjust(problem, start, progress=lambda *step: steps.append(step))
+    theirs = adjust(replace(problem, orbit=nowhere), start)
+    assert ours.iterations.tolist() == theirs.iterations.tolist()
+    assert ours.converged.all()
+    assert theirs.converged.all()
+    assert torch.equal(ours.inlier, theirs.inlier)
+    for name in ("cost", "sigma_px", "shape_weight"):
+        torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-7, atol=1e-9)
+    residual = [residuals(problem, result.state).norm for result in (ours, theirs)]
+    torch.testing.assert_close(*residual, rtol=1e-5, atol=1e-5)  # the gauge is free
+    assert steps == list(zip(range(1, len(steps) + 1), ours.history["loss"], strict=True))
+    torch.testing.assert_close(torch.tensor(ours.history["loss"]), torch.tensor(theirs.history["loss"]))

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.geometry.rotations import so3_log
-from kronc_ns.solve.bundle import Problem, ShapePrior, State, residuals
+from kronc_ns.solve.bundle import residuals
 from kronc_ns.solve.lm import LmConfig, adjust
+from kronc_ns.solve.problem import Problem, ShapePrior, State
 from kronc_ns.solve.uncertainty import camera_covariance
 from tests.solve.problems import SIMILARITY, moved, randn, scene
 

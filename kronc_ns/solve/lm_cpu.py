@@ -1,0 +1,556 @@
+"""`lm` with the Cauchy loss compiled for the CPU, one scene after the other; tests hold it against the tensors.
+
+Dense tensor operations are right for a GPU; on a CPU their dispatch and the two thirds of points that a view does not
+see cost most of the time. Here the K detections of a scene stand in a row, view by view: those of view n are
+``first[n]:first[n + 1]``. P is the number of the points' coordinates, 3J, or 0 where the points are known.
+
+All of it stands in one file, constants too, because numba's cache on disk notices changes of a function's own file
+only.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from kronc_ns.compiled import compiled
+
+BEHIND_PX = 1e4
+"""Residual of a point behind its camera: an outlier to every robust loss."""
+NEAR = 1e-6
+"""Smallest z that is "in front", in world units."""
+TINY = 1e-12
+"""Diagonal entries up to this say nothing; their unknowns stay where they are."""
+RAYLEIGH_MEDIAN = 1.1774
+"""Median norm of 2D normal noise, in standard deviations per axis."""
+CAUCHY_SIGMAS = 3.0
+TRIM_SIGMAS = 4.5
+"""One good detection in 25,000 lies farther out."""
+SIGMA_FLOOR_PX = 0.05
+COARSE = 1e-2
+"""Tolerance of the graduated phase."""
+LOOSE = 0.7
+"""A scale that lags behind the residuals by more than this goes on with the robust phase."""
+ROUNDS = 8
+START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e9
+ROBUST, TRIMMED = 0, 1
+
+
+@compiled
+def adjust_scenes(
+    rotation: Any,  # in and out [B, N, 3, 3]
+    translation: Any,  # in and out [B, N, 3]
+    points: Any,  # in and out [B, J, 3]
+    uv: Any,  # [B, N, 2, J]
+    weight: Any,  # [B, N, J]
+    focal: Any,  # [B, 2]
+    redundancy: Any,  # [B]
+    most_sigma: Any,  # [B]
+    mean: Any,  # [3J] of the shape prior
+    precision: Any,  # [3J, 3J] of the shape prior; [0, 0] without one
+    freedom: Any,
+    points_known: Any,
+    iterations: Any,
+    tolerance: Any,
+    sigma: Any,  # out [B]
+    cost: Any,  # out [B], in squared pixels
+    shape_weight: Any,  # out [B]
+    steps: Any,  # out [B]
+    converged: Any,  # out [B]
+    inlier: Any,  # out [B, N, J]
+    losses: Any,  # out [iterations], cost of the first scene after every step
+) -> None:
+    """`lm.adjust` of every scene."""
+    for b in range(len(uv)):
+        first, joint, measured, own = detections(uv[b], weight[b])
+        norm, sigma[b], cost[b], shape_weight[b], steps[b], converged[b] = _adjust(
+            rotation[b], translation[b], points[b], first, joint, measured, own, focal[b], redundancy[b],
+            most_sigma[b], mean, precision, freedom, points_known, iterations, tolerance,
+            losses if b == 0 else np.empty(0),
+        )  # fmt: skip
+        for n in range(len(first) - 1):
+            for k in range(first[n], first[n + 1]):
+                inlier[b, n, joint[k]] = norm[k] <= TRIM_SIGMAS * sigma[b]
+
+
+@compiled
+def reduce_scenes(
+    rotation: Any,  # [B, N, 3, 3]
+    translation: Any,  # [B, N, 3]
+    points: Any,  # [B, J, 3]
+    uv: Any,  # [B, N, 2, J]
+    own: Any,  # [B, N, J], the detections' own weights
+    irls: Any,  # [B, N, J]
+    focal: Any,  # [B, 2]
+    damping: Any,  # [B]
+    strength: Any,  # [B], weight of the shape prior
+    mean: Any,  # [3J] of the shape prior
+    precision: Any,  # [3J, 3J] of the shape prior; [0, 0] without one
+    whitener: Any,  # out [B, N, 6, 6]
+    whitened: Any,  # out [B, N, 6, 3J + 1], zeros
+    matrix: Any,  # out [B, 3J, 3J], lower triangle
+    rhs: Any,  # out [B, 3J]
+) -> None:
+    """`bundle.reduce_system` of every scene."""
+    pull = np.zeros(rhs.shape[1])
+    for b in range(len(uv)):
+        first, joint, measured, weight = detections(uv[b], own[b])
+        seen, error, norm = np.empty((len(joint), 3)), np.empty((len(joint), 2)), np.empty(len(joint))
+        project(rotation[b], translation[b], points[b], first, joint, measured, weight, focal[b], seen, error, norm)
+        for n in range(len(first) - 1):
+            for k in range(first[n], first[n + 1]):
+                weight[k] *= irls[b, n, joint[k]]
+        if len(precision):
+            _surprise(points[b], mean, precision, pull)
+        reduce_system(
+            rotation[b], first, joint, seen, error, weight, focal[b], damping[b], strength[b], precision, pull,
+            whitener[b], whitened[b], matrix[b], rhs[b],
+        )  # fmt: skip
+
+
+@compiled
+def _adjust(
+    rotation: Any, translation: Any, points: Any, first: Any, joint: Any, measured: Any, own: Any, focal: Any,
+    redundancy: Any, most_sigma: Any, mean: Any, precision: Any, freedom: Any, points_known: Any, iterations: Any,
+    tolerance: Any, losses: Any,
+) -> Any:  # fmt: skip
+    """One scene, its state changed in place: norms, sigma, cost, weight of the shape prior, steps, converged."""
+    count, size = len(joint), 0 if points_known else points.size
+    seen, error, norm = np.empty((count, 3)), np.empty((count, 2)), np.empty(count)
+    trial_seen, trial_error, trial_norm = np.empty((count, 3)), np.empty((count, 2)), np.empty(count)
+    trial_rotation, trial_translation = np.empty_like(rotation), np.empty_like(translation)
+    trial_points = points.copy()
+    irls, whitener, unwanted = np.empty(count), np.empty((len(rotation), 6, 6)), np.empty((0, 6, size + 1))
+    matrix, rhs, pull, trial_pull = np.empty((size, size)), np.empty(size), np.zeros(size), np.zeros(size)
+    with_prior = len(precision) > 0 and size > 0
+    surprise = trial_surprise = 0.0
+
+    project(rotation, translation, points, first, joint, measured, own, focal, seen, error, norm)
+    if with_prior:
+        surprise = _surprise(points, mean, precision, pull)
+    sigma = min(_robust_sigma(norm) * redundancy, most_sigma)
+    phase, rounds, damping = ROBUST, 0, START_DAMPING
+    cost = _cost(norm, sigma, phase, surprise, freedom, size if with_prior else 0)
+    step = 0
+    done = False
+    while step < iterations and not done:
+        step += 1
+        _weigh(norm, sigma, phase, own, irls)
+        strength = sigma * sigma * min(1.0, (freedom + size) / (freedom + surprise)) if with_prior else 0.0
+        reduce_system(
+            rotation, first, joint, seen, error, irls, focal, damping, strength, precision, pull,
+            whitener, unwanted, matrix, rhs,
+        )  # fmt: skip
+        trial_cost = np.nan
+        if _solve(matrix, rhs):
+            _move(
+                rotation, translation, points, first, joint, seen, error, irls, focal, whitener, rhs,
+                trial_rotation, trial_translation, trial_points,
+            )  # fmt: skip
+            project(
+                trial_rotation, trial_translation, trial_points, first, joint, measured, own, focal,
+                trial_seen, trial_error, trial_norm,
+            )  # fmt: skip
+            if with_prior:
+                trial_surprise = _surprise(trial_points, mean, precision, trial_pull)
+            trial_cost = _cost(trial_norm, sigma, phase, trial_surprise, freedom, size if with_prior else 0)
+        limit = COARSE if phase == ROBUST else tolerance
+        settled = abs(cost - trial_cost) <= limit * cost  # false for NaN, as is the next
+        if trial_cost < cost:
+            rotation[:], translation[:], points[:] = trial_rotation, trial_translation, trial_points
+            seen, trial_seen = trial_seen, seen
+            error, trial_error = trial_error, error
+            norm, trial_norm = trial_norm, norm
+            pull, trial_pull = trial_pull, pull
+            surprise, cost = trial_surprise, trial_cost
+            damping = max(damping / 10, LEAST_DAMPING)
+        else:
+            damping *= 10
+        settled = settled or damping > MOST_DAMPING
+        damping = min(damping, MOST_DAMPING)
+        if phase == ROBUST or settled:
+            # follow the residuals with the scale of the loss
+            shrunk = min(sigma, _robust_sigma(norm) * redundancy)
+            if phase == ROBUST:
+                sigma = shrunk
+            if settled:
+                rounds += 1
+                phase, sigma, done = _next_phase(norm, sigma, phase, shrunk, redundancy)
+                done = done or rounds >= ROUNDS
+            cost = _cost(norm, sigma, phase, surprise, freedom, size if with_prior else 0)
+        if len(losses):
+            losses[step - 1] = cost
+    usual = min(1.0, (freedom + size) / (freedom + surprise)) if with_prior else 1.0
+    return norm, sigma, cost, usual, step, done
+
+
+@compiled
+def _next_phase(norm: Any, sigma: Any, phase: Any, shrunk: Any, redundancy: Any) -> Any:
+    """From the graduated loss to the trimmed squares, and to the end when the choice of inliers stands."""
+    total, found = 0.0, 0
+    for k in range(len(norm)):
+        if norm[k] <= TRIM_SIGMAS * sigma:
+            total += norm[k] * norm[k]
+            found += 1
+    spread = min(max(np.sqrt(total / (2 * max(found, 1))) * redundancy, SIGMA_FLOOR_PX), shrunk)
+    stands = True
+    for k in range(len(norm)):
+        if (norm[k] <= TRIM_SIGMAS * sigma) != (norm[k] <= TRIM_SIGMAS * spread):
+            stands = False
+    if spread < LOOSE * sigma:
+        return ROBUST, spread, False
+    if phase == ROBUST:
+        return TRIMMED, sigma, False
+    return TRIMMED, spread, stands
+
+
+@compiled
+def _robust_sigma(norm: Any) -> Any:
+    """Noise per axis from the (lower) median of all residuals."""
+    if len(norm) == 0:
+        return 1.0
+    middle = (len(norm) - 1) // 2
+    median = np.partition(norm, middle)[middle] / RAYLEIGH_MEDIAN
+    return max(median, SIGMA_FLOOR_PX) if np.isfinite(median) else 1.0
+
+
+@compiled
+def _weigh(norm: Any, sigma: Any, phase: Any, own: Any, irls: Any) -> None:
+    """IRLS weights times the detections' own."""
+    inverse = 1.0 / (CAUCHY_SIGMAS * sigma)
+    for k in range(len(norm)):
+        if phase == ROBUST:
+            relative = norm[k] * inverse
+            irls[k] = own[k] / (1.0 + relative * relative)
+        else:
+            irls[k] = own[k] if norm[k] <= TRIM_SIGMAS * sigma else 0.0
+
+
+@compiled
+def _cost(norm: Any, sigma: Any, phase: Any, surprise: Any, freedom: Any, size: Any) -> Any:
+    """What is minimised, in squared pixels; ``size`` is 0 without a shape prior."""
+    total = 0.0
+    if phase == ROBUST:
+        scale = CAUCHY_SIGMAS * CAUCHY_SIGMAS * sigma * sigma
+        for k in range(len(norm)):
+            total += np.log1p(norm[k] * norm[k] / scale)
+        total *= scale
+    else:
+        most = TRIM_SIGMAS * TRIM_SIGMAS * sigma * sigma
+        for k in range(len(norm)):
+            square = norm[k] * norm[k]
+            total += most if square > most else square
+    if size:
+        tail = np.log(max(freedom + surprise, freedom + size) / (freedom + size)) * (freedom + size)
+        total += sigma * sigma * (min(surprise, size) + tail)
+    return total
+
+
+@compiled
+def _surprise(points: Any, mean: Any, precision: Any, pull: Any) -> Any:
+    """Squared Mahalanobis distance of the points; ``pull`` [3J] becomes half its gradient."""
+    joints = len(points)
+    deviation = np.empty(3 * joints)
+    for c in range(3):
+        for j in range(joints):
+            deviation[c * joints + j] = points[j, c] - mean[c * joints + j]
+    total = 0.0
+    for i in range(3 * joints):
+        pull[i] = 0.0
+        for k in range(3 * joints):
+            pull[i] += precision[i, k] * deviation[k]
+        total += pull[i] * deviation[i]
+    return total
+
+
+@compiled
+def detections(uv: Any, weight: Any) -> Any:
+    """Row of the detections of uv [N, 2, J] with weight [N, J] > 0: first [N + 1], joint [K], uv [K, 2], weight [K]."""
+    views, joints = weight.shape
+    first = np.zeros(views + 1, np.int64)
+    joint, measured, own = np.empty(weight.size, np.int64), np.empty((weight.size, 2)), np.empty(weight.size)
+    k = 0
+    for n in range(views):
+        for j in range(joints):
+            if weight[n, j] > 0.0:
+                joint[k], measured[k, 0], measured[k, 1], own[k] = j, uv[n, 0, j], uv[n, 1, j], weight[n, j]
+                k += 1
+        first[n + 1] = k
+    return first, joint[:k].copy(), measured[:k].copy(), own[:k].copy()
+
+
+@compiled
+def project(
+    rotation: Any,  # [N, 3, 3]
+    translation: Any,  # [N, 3]
+    points: Any,  # [J, 3]
+    first: Any,  # [N + 1]
+    joint: Any,  # [K]
+    measured: Any,  # [K, 2]
+    own: Any,  # [K]
+    focal: Any,  # [2]
+    seen: Any,  # out [K, 3]: normalised image coordinates, 1 / z
+    error: Any,  # out [K, 2]: projection minus detection in pixels; 0 behind the camera
+    norm: Any,  # out [K]: its weighted length; BEHIND_PX behind the camera
+) -> None:
+    """`bundle.residuals` without intrinsics."""
+    for n in range(len(rotation)):
+        r, t = rotation[n], translation[n]
+        for k in range(first[n], first[n + 1]):
+            j = joint[k]
+            x, y, z = points[j, 0], points[j, 1], points[j, 2]
+            depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
+            inverse = 1.0 / max(depth, NEAR)
+            u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) * inverse
+            v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) * inverse
+            seen[k, 0], seen[k, 1], seen[k, 2] = u, v, inverse
+            error[k, 0] = error[k, 1] = 0.0
+            norm[k] = BEHIND_PX
+            if not depth < NEAR:
+                du, dv = focal[0] * u - measured[k, 0], focal[1] * v - measured[k, 1]
+                error[k, 0], error[k, 1] = du, dv
+                norm[k] = np.sqrt(own[k] * (du * du + dv * dv))
+
+
+@compiled
+def reduce_system(
+    rotation: Any,  # [N, 3, 3]
+    first: Any,  # [N + 1]
+    joint: Any,  # [K]
+    seen: Any,  # [K, 3], from `project`
+    error: Any,  # [K, 2], from `project`
+    weight: Any,  # [K], IRLS weights times the detections' own
+    focal: Any,  # [2]
+    damping: Any,
+    strength: Any,  # weight of the shape prior
+    precision: Any,  # [3J, 3J], its inverse covariance; [0, 0] without one
+    pull: Any,  # [P], half its gradient
+    whitener: Any,  # out [N, 6, 6]: inverse Cholesky factors of the cameras' blocks
+    whitened: Any,  # out [N, 6, P + 1], zeros: cameras against points, and their gradient; [0, ...] if not wanted
+    matrix: Any,  # out [P, P], lower triangle
+    rhs: Any,  # out [P]
+) -> None:
+    """`bundle.linearise` and `bundle.eliminate_cameras` in one pass over the detections."""
+    size = len(rhs)
+    joints = size // 3
+    a, rows = np.empty((2, 6)), np.empty((2, 3))
+    camera, right = np.empty((6, 6)), np.empty(6)
+    columns = np.empty(size, np.int64)
+    mixed, y, dots = np.empty((6, size)), np.empty((6, size)), np.empty((2, size))
+    diagonal = np.empty(size)
+    with_prior = len(precision) > 0
+    for i in range(size):
+        for k in range(i + 1):
+            matrix[i, k] = strength * precision[i, k] if with_prior else 0.0
+        rhs[i] = -strength * pull[i] if with_prior else 0.0
+        diagonal[i] = matrix[i, i]
+    for n in range(len(rotation)):
+        camera[:] = 0.0
+        right[:] = 0.0
+        count = 0
+        for k in range(first[n], first[n + 1]):
+            count += weight[k] > 0.0
+        width = 3 * count if size else 0
+        at = 0
+        for k in range(first[n], first[n + 1]):
+            if not weight[k] > 0.0:
+                continue
+            _rows(seen[k], weight[k], focal, rotation[n], a, rows)
+            root = np.sqrt(weight[k])
+            du, dv = root * error[k, 0], root * error[k, 1]
+            for p in range(6):
+                right[p] += a[0, p] * du + a[1, p] * dv
+                for q in range(p + 1):
+                    camera[p, q] += a[0, p] * a[0, q] + a[1, p] * a[1, q]
+            if size == 0:
+                continue
+            for c in range(3):
+                for p in range(6):
+                    mixed[p, c * count + at] = a[0, p] * rows[0, c] + a[1, p] * rows[1, c]
+                i = c * joints + joint[k]
+                columns[c * count + at] = i
+                rhs[i] -= rows[0, c] * du + rows[1, c] * dv
+                diagonal[i] += rows[0, c] * rows[0, c] + rows[1, c] * rows[1, c]
+                for d in range(c + 1):
+                    matrix[i, d * joints + joint[k]] += rows[0, c] * rows[0, d] + rows[1, c] * rows[1, d]
+            at += 1
+        for p in range(6):
+            camera[p, p] = _damped(camera[p, p], damping)
+        w = whitener[n]
+        _inverse_factor(camera, w)
+        for p in range(6):
+            y[p, :width] = 0.0
+            total = 0.0
+            for q in range(p + 1):
+                factor = w[p, q]
+                total += factor * right[q]
+                for i in range(width):
+                    y[p, i] += factor * mixed[q, i]
+            for i in range(width):
+                rhs[columns[i]] += y[p, i] * total
+            if n < len(whitened):
+                whitened[n, p, size] = total
+                for i in range(width):
+                    whitened[n, p, columns[i]] = y[p, i]
+        # two rows at a time share the loads; the last row of an odd width is computed twice
+        for i in range(0, width, 2):
+            m = min(i + 1, width - 1)
+            y0, y1, y2, y3, y4, y5 = y[0, i], y[1, i], y[2, i], y[3, i], y[4, i], y[5, i]
+            z0, z1, z2, z3, z4, z5 = y[0, m], y[1, m], y[2, m], y[3, m], y[4, m], y[5, m]
+            for k in range(m + 1):
+                x0, x1, x2, x3, x4, x5 = y[0, k], y[1, k], y[2, k], y[3, k], y[4, k], y[5, k]
+                dots[0, k] = y0 * x0 + y1 * x1 + y2 * x2 + y3 * x3 + y4 * x4 + y5 * x5
+                dots[1, k] = z0 * x0 + z1 * x1 + z2 * x2 + z3 * x3 + z4 * x4 + z5 * x5
+            upper, lower = matrix[columns[i]], matrix[columns[m]]
+            for k in range(i + 1):
+                upper[columns[k]] -= dots[0, k]
+            if m > i:
+                for k in range(m + 1):
+                    lower[columns[k]] -= dots[1, k]
+    for i in range(size):
+        matrix[i, i] += _damped(diagonal[i], damping) - diagonal[i]
+
+
+@compiled
+def _move(
+    rotation: Any, translation: Any, points: Any, first: Any, joint: Any, seen: Any, error: Any, weight: Any,
+    focal: Any, whitener: Any, change: Any, to_rotation: Any, to_translation: Any, to_points: Any,
+) -> None:  # fmt: skip
+    """The rest of `bundle.solve_step`, and `bundle.move`: each camera's step for the points' change, all applied."""
+    a, rows = np.empty((2, 6)), np.empty((2, 3))
+    right, step, turn = np.empty(6), np.empty(6), np.empty((3, 3))
+    joints = len(change) // 3
+    for j in range(joints):
+        for c in range(3):
+            to_points[j, c] = points[j, c] + change[c * joints + j]
+    for n in range(len(rotation)):
+        r, t, w = rotation[n], translation[n], whitener[n]
+        right[:] = 0.0
+        for k in range(first[n], first[n + 1]):
+            _rows(seen[k], weight[k], focal, r, a, rows)
+            root = np.sqrt(weight[k])
+            du, dv = root * error[k, 0], root * error[k, 1]
+            if joints:
+                for c in range(3):
+                    du += rows[0, c] * change[c * joints + joint[k]]
+                    dv += rows[1, c] * change[c * joints + joint[k]]
+            for p in range(6):
+                right[p] += a[0, p] * du + a[1, p] * dv
+        step[:] = 0.0
+        for p in range(6):
+            total = 0.0
+            for q in range(p + 1):
+                total += w[p, q] * right[q]
+            for q in range(p + 1):
+                step[q] -= w[p, q] * total
+        _exponential(step, turn)
+        for p in range(3):
+            to_translation[n, p] = turn[p, 0] * t[0] + turn[p, 1] * t[1] + turn[p, 2] * t[2] + step[3 + p]
+            for c in range(3):
+                to_rotation[n, p, c] = turn[p, 0] * r[0, c] + turn[p, 1] * r[1, c] + turn[p, 2] * r[2, c]
+
+
+@compiled
+def _rows(seen: Any, weight: Any, focal: Any, r: Any, a: Any, rows: Any) -> None:
+    """Derivatives of a point's weighted projection (both axes) by its camera [2, 6] and by itself [2, 3]."""
+    u, v, near = seen[0], seen[1], seen[2]
+    root = np.sqrt(weight)
+    along, down = root * focal[0], root * focal[1]
+    a[0, 0], a[0, 1], a[0, 2] = -along * u * v, along * (1.0 + u * u), -along * v
+    a[0, 3], a[0, 4], a[0, 5] = along * near, 0.0, -along * u * near
+    a[1, 0], a[1, 1], a[1, 2] = -down * (1.0 + v * v), down * u * v, down * u
+    a[1, 3], a[1, 4], a[1, 5] = 0.0, down * near, -down * v * near
+    for c in range(3):
+        rows[0, c] = along * near * (r[0, c] - u * r[2, c])
+        rows[1, c] = down * near * (r[1, c] - v * r[2, c])
+
+
+@compiled
+def _damped(entry: Any, damping: Any) -> Any:
+    """A diagonal entry with Marquardt's damping, kept off zero."""
+    return (1.0 + damping) * (1.0 if entry <= TINY else entry)
+
+
+@compiled
+def _exponential(w: Any, out: Any) -> None:
+    """Rotation of the rotation vector in the first three entries of ``w`` (Rodrigues)."""
+    square = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    angle = np.sqrt(square)
+    if angle < 1e-4:  # the next term of either series is below rounding
+        sine, versine = 1.0 - square / 6.0, 0.5 - square / 24.0
+    else:
+        sine, versine = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
+    for p in range(3):
+        for q in range(3):
+            out[p, q] = versine * w[p] * w[q]
+        out[p, p] += 1.0 - versine * square
+    out[0, 1] -= sine * w[2]
+    out[1, 0] += sine * w[2]
+    out[0, 2] += sine * w[1]
+    out[2, 0] -= sine * w[1]
+    out[1, 2] -= sine * w[0]
+    out[2, 1] += sine * w[0]
+
+
+@compiled
+def _inverse_factor(matrix: Any, out: Any) -> None:
+    """Inverse of the lower Cholesky factor of a 6x6 matrix (lower triangle), which is destroyed."""
+    for i in range(6):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = np.sqrt(total) if i == j else total / matrix[j, j]
+    for j in range(6):
+        for i in range(6):
+            if i < j:
+                out[i, j] = 0.0
+                continue
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= matrix[i, k] * out[k, j]
+            out[i, j] = total / matrix[i, i]
+
+
+@compiled
+def _solve(matrix: Any, rhs: Any) -> Any:
+    """Solve in place by Cholesky's factors of the lower triangle; False where it is not positive definite."""
+    size = len(rhs)
+    for j in range(size):
+        row = matrix[j]
+        total = row[j]
+        for k in range(j):
+            total -= row[k] * row[k]
+        if not total > 0.0:
+            return False
+        row[j] = np.sqrt(total)
+        inverse = 1.0 / row[j]
+        i = j + 1
+        while i + 3 < size:  # four rows at a time share the loads
+            r0, r1, r2, r3 = matrix[i], matrix[i + 1], matrix[i + 2], matrix[i + 3]
+            s0 = s1 = s2 = s3 = 0.0
+            for k in range(j):
+                x = row[k]
+                s0 += r0[k] * x
+                s1 += r1[k] * x
+                s2 += r2[k] * x
+                s3 += r3[k] * x
+            r0[j] = (r0[j] - s0) * inverse
+            r1[j] = (r1[j] - s1) * inverse
+            r2[j] = (r2[j] - s2) * inverse
+            r3[j] = (r3[j] - s3) * inverse
+            i += 4
+        while i < size:
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * row[k]
+            matrix[i, j] = total * inverse
+            i += 1
+    for i in range(size):
+        for k in range(i):
+            rhs[i] -= matrix[i, k] * rhs[k]
+        rhs[i] /= matrix[i, i]
+    for i in range(size - 1, -1, -1):
+        rhs[i] /= matrix[i, i]
+        for k in range(i):
+            rhs[k] -= matrix[i, k] * rhs[i]
+    return True
