@@ -9,14 +9,12 @@ All of it stands in one file because numba's cache on disk notices changes of a 
 Arrays are flat over cameras: M = cameras x Gaussians, K = (tile, Gaussian) pairs, T = cameras x tiles.
 """
 
-import contextlib
 import math
-from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 
+from kronc_ns.compiled import compiled
 from kronc_ns.plugin.splat_cpu.tiles import TILE
 
 ALPHA_MIN = np.float32(1 / 255)  # fainter contributions are skipped
@@ -33,24 +31,8 @@ REACH = np.float32(5.6)  # past log(255) even an opaque Gaussian is fainter than
 EIGHTH, MIDDLE = np.float32(1 / 8), np.float32(5.6 / 16)
 C0, C1, C2, C3, C4, C5, C6, C7 = (np.float32((-1) ** n / math.factorial(n) * math.exp(-5.6 / 16)) for n in range(8))
 
-# Without nnan and ninf: a Gaussian that went astray may hold NaN, and comparisons with it must stay false.
-_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 
-
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``numba.njit``, kept on disk where numba finds a folder it may write to, else compiled in every process.
-
-    Not numba's own parallel loops: their threads fight with torch's for the cores when something else runs, and with
-    GNU's OpenMP a fork after their first use ends the process. The kernels release the GIL and take shares of the work.
-    """
-    # error_model: a division that may raise ends the vector instructions
-    compiled = numba.njit(nogil=True, fastmath=_FASTMATH, error_model="numpy")(function)
-    with contextlib.suppress(RuntimeError):  # neither __pycache__ nor the user's cache nor NUMBA_CACHE_DIR
-        compiled.enable_caching()
-    return compiled
-
-
-@_compiled
+@compiled
 def _falloff(sigma: Any) -> Any:
     """exp(-sigma) for sigma in [0, REACH], from products only: a call of ``exp`` would end the vector instructions."""
     u = min(sigma, REACH) * EIGHTH - MIDDLE
@@ -60,7 +42,7 @@ def _falloff(sigma: Any) -> Any:
     return e * e
 
 
-@_compiled
+@compiled
 def _rows(mx: float, my: float, a: float, b: float, c: float, opacity: float, height: int) -> tuple[int, int]:
     """First row and last row + 1 of a tile that the ellipse ``alpha >= ALPHA_MIN`` reaches, at most one too many.
 
@@ -76,7 +58,7 @@ def _rows(mx: float, my: float, a: float, b: float, c: float, opacity: float, he
     return int(max(0.0, math.floor(my - half_y - 0.5))), int(min(float(height), math.ceil(my + half_y + 0.5)))
 
 
-@_compiled
+@compiled
 def _workspace(channels: int, height: int, width: int, dtype: Any) -> np.ndarray:
     """Planes for a tile of which ``height`` x ``width`` pixels lie in the image."""
     work = np.zeros((PLANES + channels, TILE, TILE), dtype)
@@ -88,7 +70,7 @@ def _workspace(channels: int, height: int, width: int, dtype: Any) -> np.ndarray
     return work
 
 
-@_compiled
+@compiled
 def _any_open(work: np.ndarray, row_open: np.ndarray) -> bool:
     """Whether a tile has open pixels left, and in ``row_open [TILE]`` which of its rows."""
     anywhere = False
@@ -101,7 +83,7 @@ def _any_open(work: np.ndarray, row_open: np.ndarray) -> bool:
     return anywhere
 
 
-@_compiled
+@compiled
 def _composite_tile(
     means2d: np.ndarray,
     conics: np.ndarray,
@@ -161,7 +143,7 @@ def _composite_tile(
                 render[top + y, left + x, d] = work[PLANES + d, y, x] + work[PASSED, y, x] * background[d]
 
 
-@_compiled
+@compiled
 def rasterize_forward(
     share: np.ndarray,
     means2d: np.ndarray,
@@ -189,7 +171,7 @@ def rasterize_forward(
         _composite_tile(means2d, conics, colors, opacities, backgrounds[camera], listed, top, left, *image)
 
 
-@_compiled
+@compiled
 def _differentiate_tile(
     means2d: np.ndarray,
     conics: np.ndarray,
@@ -284,7 +266,7 @@ def _differentiate_tile(
         v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7] = v_x, v_y, v_x_abs, v_y_abs, v_a, v_b, v_c, v_opacity
 
 
-@_compiled
+@compiled
 def rasterize_backward(
     share: np.ndarray,
     means2d: np.ndarray,
@@ -319,7 +301,7 @@ def rasterize_backward(
         _differentiate_tile(means2d, conics, colors, opacities, *listed, top, left, *image, *wanted)
 
 
-@_compiled
+@compiled
 def sum_over_tiles(v_pairs: np.ndarray, starts: np.ndarray, order: np.ndarray, v_gaussians: np.ndarray) -> None:
     """Add the rows ``starts[i]:starts[i+1]`` of ``v_pairs [K,F]`` into row ``order[i]`` of ``v_gaussians [M,F]``."""
     for i in range(len(order)):
