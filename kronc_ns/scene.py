@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -51,12 +52,12 @@ class Scene:
     def __len__(self) -> int:
         return len(self.names)
 
-    @property
+    @cached_property
     def visibility(self) -> Float[Tensor, "n j"]:
         """The paper's m: 1 where a keypoint was found, else 0."""
         return (self.keypoints[..., 2] > 0).to(self.keypoints.dtype)
 
-    @property
+    @cached_property
     def uv(self) -> Float[Tensor, "n j 2"]:
         """Pixels with lens distortion removed."""
         return self.camera.undistort(self.keypoints[..., :2])

@@ -24,6 +24,8 @@ _PARALLAX_DEG = 3.0
 """Views that see the points from within this angle hardly tell how far these are."""
 _ALIKE = 0.005
 """Keypoints that move less than this share of the diagonal between views show no other side."""
+_SAMPLED_VIEWS = 16
+"""So many views, evenly spread, tell whether all are alike."""
 _ODD_SHAPE = 0.25
 """Weight of the shape prior below which the solved points hardly look like a car."""
 
@@ -161,7 +163,9 @@ def _parallax_deg(solution: Solution, solved: Bool[Tensor, "n"]) -> float:
 
 def _all_alike(scene: Scene, solved: Bool[Tensor, "n"]) -> bool:
     """Whether the views show the same picture: then poses differ by the start's doing only."""
-    shared = (scene.visibility > 0) & (scene.visibility[solved].sum(0) > 1)
-    uv = torch.where(shared[..., None], scene.uv, math.nan)[solved]
+    chosen = solved.nonzero()[:, 0]
+    chosen = chosen[torch.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLED_VIEWS)).long()]
+    seen = scene.visibility[chosen] > 0
+    uv = torch.where((seen & (seen.sum(0) > 1))[..., None], scene.uv[chosen], math.nan)
     middle = uv.nanmedian(0).values
     return float((uv - middle).norm(dim=-1).nanmedian()) < _ALIKE * math.hypot(scene.camera.width, scene.camera.height)

@@ -332,10 +332,13 @@ def reduce_system(
     """`bundle.linearise` and `bundle.eliminate_cameras` in one pass over the detections."""
     size = len(rhs)
     joints = size // 3
-    a, rows = np.empty((2, 6)), np.empty((2, 3))
+    most = 0
+    for n in range(len(rotation)):
+        most = max(most, first[n + 1] - first[n])
+    a, rows, off = np.empty((6, 2 * most)), np.empty((3, 2 * most)), np.empty(2 * most)
     camera, right = np.empty((6, 6)), np.empty(6)
-    columns = np.empty(size, np.int64)
-    mixed, y, dots = np.empty((6, size)), np.empty((6, size)), np.empty((2, size))
+    columns = np.empty(3 * most, np.uint64)  # unsigned: else every access asks whether it counts from the end
+    mixed, y, dots = np.empty((6, 3 * most)), np.empty((6, 3 * most)), np.empty((2, 3 * most))
     diagonal = np.empty(size)
     with_prior = len(precision) > 0
     for i in range(size):
@@ -344,39 +347,31 @@ def reduce_system(
         rhs[i] = -strength * pull[i] if with_prior else 0.0
         diagonal[i] = matrix[i, i]
     for n in range(len(rotation)):
-        camera[:] = 0.0
-        right[:] = 0.0
-        count = 0
-        for k in range(first[n], first[n + 1]):
-            count += weight[k] > 0.0
-        width = 3 * count if size else 0
-        at = 0
-        for k in range(first[n], first[n + 1]):
-            if not weight[k] > 0.0:
-                continue
-            _rows(seen[k], weight[k], focal, rotation[n], a, rows)
-            root = np.sqrt(weight[k])
-            du, dv = root * error[k, 0], root * error[k, 1]
-            for p in range(6):
-                right[p] += a[0, p] * du + a[1, p] * dv
-                for q in range(p + 1):
-                    camera[p, q] += a[0, p] * a[0, q] + a[1, p] * a[1, q]
-            if size == 0:
-                continue
-            for c in range(3):
-                for p in range(6):
-                    mixed[p, c * count + at] = a[0, p] * rows[0, c] + a[1, p] * rows[1, c]
-                i = c * joints + joint[k]
-                columns[c * count + at] = i
-                rhs[i] -= rows[0, c] * du + rows[1, c] * dv
-                diagonal[i] += rows[0, c] * rows[0, c] + rows[1, c] * rows[1, c]
-                for d in range(c + 1):
-                    matrix[i, d * joints + joint[k]] += rows[0, c] * rows[0, d] + rows[1, c] * rows[1, d]
-            at += 1
+        begin, count = first[n], first[n + 1] - first[n]
+        _rows(seen[begin:], error[begin:], weight[begin:], focal, rotation[n], count, a, rows, off)
         for p in range(6):
+            right[p] = _dot(a[p], off, 2 * count)
+            for q in range(p + 1):
+                camera[p, q] = _dot(a[p], a[q], 2 * count)
             camera[p, p] = _damped(camera[p, p], damping)
         w = whitener[n]
         _inverse_factor(camera, w)
+        width = 3 * count if size else 0
+        if width:
+            for c in range(3):
+                for k in range(count):
+                    columns[c * count + k] = c * joints + joint[begin + k]
+                for p in range(6):
+                    into = mixed[p, c * count :]
+                    for k in range(count):
+                        into[k] = a[p, k] * rows[c, k] + a[p, count + k] * rows[c, count + k]
+                for k in range(count):
+                    i = columns[c * count + k]
+                    rhs[i] -= rows[c, k] * off[k] + rows[c, count + k] * off[count + k]
+                    diagonal[i] += rows[c, k] * rows[c, k] + rows[c, count + k] * rows[c, count + k]
+                    for d in range(c + 1):
+                        square = rows[c, k] * rows[d, k] + rows[c, count + k] * rows[d, count + k]
+                        matrix[i, columns[d * count + k]] += square
         for p in range(6):
             y[p, :width] = 0.0
             total = 0.0
@@ -416,7 +411,10 @@ def _move(
     focal: Any, whitener: Any, change: Any, to_rotation: Any, to_translation: Any, to_points: Any,
 ) -> None:  # fmt: skip
     """The rest of `bundle.solve_step`, and `bundle.move`: each camera's step for the points' change, all applied."""
-    a, rows = np.empty((2, 6)), np.empty((2, 3))
+    most = 0
+    for n in range(len(rotation)):
+        most = max(most, first[n + 1] - first[n])
+    a, rows, off = np.empty((6, 2 * most)), np.empty((3, 2 * most)), np.empty(2 * most)
     right, step, turn = np.empty(6), np.empty(6), np.empty((3, 3))
     joints = len(change) // 3
     for j in range(joints):
@@ -424,17 +422,16 @@ def _move(
             to_points[j, c] = points[j, c] + change[c * joints + j]
     for n in range(len(rotation)):
         r, t, w = rotation[n], translation[n], whitener[n]
-        right[:] = 0.0
-        for k in range(first[n], first[n + 1]):
-            _rows(seen[k], weight[k], focal, r, a, rows)
-            root = np.sqrt(weight[k])
-            du, dv = root * error[k, 0], root * error[k, 1]
-            if joints:
+        begin, count = first[n], first[n + 1] - first[n]
+        _rows(seen[begin:], error[begin:], weight[begin:], focal, r, count, a, rows, off)
+        if joints:
+            for k in range(count):
                 for c in range(3):
-                    du += rows[0, c] * change[c * joints + joint[k]]
-                    dv += rows[1, c] * change[c * joints + joint[k]]
-            for p in range(6):
-                right[p] += a[0, p] * du + a[1, p] * dv
+                    moved = change[c * joints + joint[begin + k]]
+                    off[k] += rows[c, k] * moved
+                    off[count + k] += rows[c, count + k] * moved
+        for p in range(6):
+            right[p] = _dot(a[p], off, 2 * count)
         step[:] = 0.0
         for p in range(6):
             total = 0.0
@@ -450,18 +447,31 @@ def _move(
 
 
 @compiled
-def _rows(seen: Any, weight: Any, focal: Any, r: Any, a: Any, rows: Any) -> None:
-    """Derivatives of a point's weighted projection (both axes) by its camera [2, 6] and by itself [2, 3]."""
-    u, v, near = seen[0], seen[1], seen[2]
-    root = np.sqrt(weight)
-    along, down = root * focal[0], root * focal[1]
-    a[0, 0], a[0, 1], a[0, 2] = -along * u * v, along * (1.0 + u * u), -along * v
-    a[0, 3], a[0, 4], a[0, 5] = along * near, 0.0, -along * u * near
-    a[1, 0], a[1, 1], a[1, 2] = -down * (1.0 + v * v), down * u * v, down * u
-    a[1, 3], a[1, 4], a[1, 5] = 0.0, down * near, -down * v * near
-    for c in range(3):
-        rows[0, c] = along * near * (r[0, c] - u * r[2, c])
-        rows[1, c] = down * near * (r[1, c] - v * r[2, c])
+def _rows(seen: Any, error: Any, weight: Any, focal: Any, r: Any, count: Any, a: Any, rows: Any, off: Any) -> None:
+    """Derivatives of the first ``count`` weighted projections, along x and then along y, and the errors themselves.
+
+    By the camera, a [6, 2 count], and by the point, rows [3, 2 count]; off [2 count].
+    """
+    for k in range(count):
+        u, v, near, root = seen[k, 0], seen[k, 1], seen[k, 2], np.sqrt(weight[k])
+        along, down, m = root * focal[0], root * focal[1], count + k
+        a[0, k], a[1, k], a[2, k] = -along * u * v, along * (1.0 + u * u), -along * v
+        a[3, k], a[4, k], a[5, k] = along * near, 0.0, -along * u * near
+        a[0, m], a[1, m], a[2, m] = -down * (1.0 + v * v), down * u * v, down * u
+        a[3, m], a[4, m], a[5, m] = 0.0, down * near, -down * v * near
+        off[k], off[m] = root * error[k, 0], root * error[k, 1]
+        for c in range(3):
+            rows[c, k] = along * near * (r[0, c] - u * r[2, c])
+            rows[c, m] = down * near * (r[1, c] - v * r[2, c])
+
+
+@compiled
+def _dot(x: Any, y: Any, count: Any) -> Any:
+    """Sum of products of the first ``count`` entries."""
+    total = 0.0
+    for k in range(count):
+        total += x[k] * y[k]
+    return total
 
 
 @compiled

@@ -38,10 +38,13 @@ def camera_covariance(
     # A camera follows the points by -W^T Y, and the gauge's part of their error, motion gauge^T, is taken off it. With
     # Z = Y L^-T and G = L^-1 gauge its covariance is W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T.
     z = torch.linalg.solve_triangular(factor.mT, reduced.whitened[..., :size], upper=True, left=False)
-    z, g = z.view(b, n, 6, size), torch.linalg.solve_triangular(factor, gauge, upper=False)
-    spread = reduced.whitener.mT @ z + motion @ g.mT[:, None]
-    own = reduced.whitener.mT @ reduced.whitener
-    covariance = (own + spread @ spread.mT) * sigma_px.square()[:, None, None, None]
+    g = torch.linalg.solve_triangular(factor, gauge, upper=False)
+    mixed, z = (z @ g).view(b, n, 6, 7), z.view(b, n, 6, size)
+    own = z @ z.mT + torch.eye(6, dtype=z.dtype, device=z.device)
+    shared = (g.mT @ g)[:, None].expand(b, n, 7, 7)
+    inner = torch.cat([torch.cat([own, mixed], -1), torch.cat([mixed.mT, shared], -1)], -2)
+    outer = torch.cat([reduced.whitener.mT, motion], -1)
+    covariance = (outer @ inner @ outer.mT) * sigma_px.square()[:, None, None, None]
     # the centre moves by -v (in camera axes) when the translation grows by v
     sign = covariance.new_tensor([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     return covariance * sign[:, None] * sign
