@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,7 +15,7 @@ from rich.table import Table
 from kronc_ns.batch import expand, solve_folders
 from kronc_ns.benchmark.command import Bench
 from kronc_ns.config import SolverOptions
-from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
+from kronc_ns.console import exit_on_error, exit_status, metrics_table, progress_bar, report_table
 from kronc_ns.errors import KroncError
 from kronc_ns.evaluate import evaluate_poses
 from kronc_ns.export import claim_output, write_colmap, write_ply, write_solution
@@ -60,18 +61,34 @@ class Solve(SolverOptions):
 
 @dataclass(kw_only=True)
 class Eval:
-    """Compare poses with a reference after similarity alignment."""
+    """Compare poses with a reference (--poses, --reference), or a trained run with its test views (--nvs)."""
 
-    poses: Path
-    """transforms.json with the poses to judge."""
-    reference: Path
+    poses: Path | None = None
+    """transforms.json with the poses to judge, after similarity alignment."""
+    reference: Path | None = None
     """transforms.json (or reference.json) with the true or trusted poses."""
+    nvs: Path | None = None
+    """config.yml of a trained run of any nerfstudio method. PSNR, SSIM and LPIPS are given of the full frame and,
+    where masks or alpha tell it, of the vehicle alone."""
+    pictures: Path | None = None
+    """With --nvs: new folder for a picture of every test view, rendered | truth | error (brightest from 0.25 on)."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
         """Print the errors."""
-        errors = evaluate_poses(read_poses(self.poses), read_poses(self.reference)).as_dict()
+        if self.nvs is not None:
+            if self.poses is not None or self.reference is not None:
+                raise KroncError("--nvs with --poses or --reference: expected either a trained run or poses")
+            return self._views(self.nvs)
+        if self.poses is None or self.reference is None:
+            raise KroncError("expected --poses and --reference, or --nvs with the config.yml of a trained run")
+        if self.pictures is not None:
+            raise KroncError(f"--pictures {self.pictures} without --nvs: only test views can be drawn")
+        return self._poses(self.poses, self.reference)
+
+    def _poses(self, poses: Path, reference: Path) -> int:
+        errors = evaluate_poses(read_poses(poses), read_poses(reference)).as_dict()
         if self.json:
             print(json.dumps(errors))
             return 0
@@ -80,6 +97,21 @@ class Eval:
             table.add_row(label, *(f"{errors[key][which]:.4f}" for which in ("mean", "median", "max")))
         Console().print(table)
         print("  ".join(f"{key} {errors[key]:.4f}" for key in errors if key.startswith("auc")))
+        return 0
+
+    def _views(self, config: Path) -> int:
+        # seconds of nerfstudio's imports, which no other command needs
+        from kronc_ns.plugin.compatibility import lpips_remedy
+        from kronc_ns.plugin.evaluate import evaluate_run
+
+        with progress_bar("rendering") as progress:
+            result = evaluate_run(config, self.pictures, progress)
+        if result["full"]["lpips"] is None:
+            print(f"LPIPS is not available: {lpips_remedy()}", file=sys.stderr)
+        if self.json:
+            print(json.dumps(result, allow_nan=False))
+            return 0
+        Console().print(metrics_table(result))
         return 0
 
 

@@ -6,6 +6,7 @@ import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import PurePosixPath
 from typing import Any
 
 from rich.console import Console
@@ -16,6 +17,7 @@ from kronc_ns.errors import KroncError
 from kronc_ns.solve.solution import Status, ViewStatus
 
 _LISTED = 8  # failed views named in the table
+_METRICS = {"psnr": 2, "ssim": 4, "lpips": 4}  # decimals
 
 
 @contextmanager
@@ -94,4 +96,22 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> Table:
     table.add_row("time", f"{report['seconds']:.3f} s")
     for note in notes:
         table.add_row("note", note)
+    return table
+
+
+def metrics_table(result: Mapping[str, Any]) -> Table:
+    """The content of `kronc eval --nvs --json`: full frame and vehicle, a line for each test view, means last."""
+    title = f"{result['method']}, step {result['step']}: {result['views']} test views"
+    table = Table(title=title, title_justify="left")
+    table.add_column("view", no_wrap=True)
+    columns = [(part, metric, digits) for part in ("full", "masked") for metric, digits in _METRICS.items()]
+    for part, metric, _ in columns:
+        table.add_column(f"{'vehicle' if part == 'masked' else 'frame'}\n{metric.upper()}", justify="right")
+    rows = [(PurePosixPath(image["file_path"]).name, image) for image in result["images"]]
+    for name, row in [*rows, ("mean", result)]:
+        values = ((row[part] or {}).get(metric) for part, metric, _ in columns)
+        cells = (
+            "-" if value is None else f"{value:.{column[2]}f}" for value, column in zip(values, columns, strict=True)
+        )
+        table.add_row(name, *cells, end_section=row is rows[-1][1])
     return table

@@ -26,11 +26,13 @@ with jaxtyping.install_import_hook(
         "kronc_ns.repair",
         "kronc_ns.completion",
         "kronc_ns.evaluate",
+        "kronc_ns.image_metrics",
     ],
     "beartype.beartype",
 ):
     import kronc_ns.completion
     import kronc_ns.evaluate
+    import kronc_ns.image_metrics
     import kronc_ns.init
     import kronc_ns.keypoints.select
     import kronc_ns.objective

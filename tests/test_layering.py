@@ -17,7 +17,7 @@ LAYERS = [
     {"adjustment", "repair"},
     {"verify"},
     {"pipeline"},
-    {"config", "evaluate", "capture", "export", "report", "plots", "viewer"},
+    {"config", "evaluate", "image_metrics", "capture", "export", "report", "plots", "viewer"},
     {"synthetic", "console", "benchmark"},
     {"batch"},
     {"cli", "plugin"},

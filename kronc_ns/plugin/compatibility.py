@@ -26,6 +26,11 @@ def allow_numpy_in_checkpoints() -> None:
     torch.serialization.add_safe_globals([np.dtype, *float_types, *((multiarray.scalar, name) for name in names)])
 
 
+def lpips_remedy() -> str:
+    """Which weights LPIPS needs and where it looks for them."""
+    return f"put torchvision's alexnet-owt-7be5be79.pth into {torch.hub.get_dir()}/checkpoints to have it"
+
+
 class UnavailableLpips(torch.nn.Module):
     """Stands where LPIPS cannot be computed for want of weights: every value is NaN, never a number."""
 
@@ -50,8 +55,7 @@ def train_without_lpips_weights() -> None:
             return genuine(*args, **kwargs)
         except OSError as error:
             warnings.warn(
-                f"LPIPS is unavailable and reported as nan: its weights cannot be loaded ({error}); put "
-                f"alexnet-owt-7be5be79.pth into {torch.hub.get_dir()}/checkpoints to have it",
+                f"LPIPS is unavailable and reported as nan: its weights cannot be loaded ({error}); {lpips_remedy()}",
                 stacklevel=2,
             )
             return UnavailableLpips()
