@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from kronc_ns.errors import KroncError
 from kronc_ns.files import write_json
-from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KNOWN_SCHEMAS, KeypointSchema, schema_of_count
 
 FORMATS = "our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO keypoint JSON"
 
@@ -53,11 +53,6 @@ def write_keypoints(
     path: Path, schema: KeypointSchema, size: tuple[int, int], frames: Mapping[str, Float[np.ndarray, "j 3"]]
 ) -> None:
     """Write our ``keypoints.json`` (the contract of the scene folder)."""
-    if schema == APOLLOCAR3D_66:
-        described: Any = schema.name
-    else:
-        flip = [[i, f] for i, f in enumerate(schema.flip) if i < f]
-        described = {"name": schema.name, "keypoints": list(schema.keypoints), "flip": flip}
     rows = [
         {
             "file_path": name,
@@ -65,7 +60,7 @@ def write_keypoints(
         }
         for name, uvc in frames.items()
     ]
-    write_json(path, {"schema": described, "width": size[0], "height": size[1], "frames": rows})
+    write_json(path, {"schema": describe_schema(schema), "width": size[0], "height": size[1], "frames": rows})
 
 
 def read_json(path: Path) -> Any:
@@ -97,12 +92,22 @@ def _rows(values: Any, schema: KeypointSchema, where: str) -> Float[np.ndarray, 
     return np.where(seen[:, None], rows, 0.0)
 
 
-def _read_schema(described: Any, path: Path) -> KeypointSchema:
-    if described == APOLLOCAR3D_66.name:
-        return APOLLOCAR3D_66
+def describe_schema(schema: KeypointSchema) -> Any:
+    """A schema as JSON holds it: its name where that is known, else spelt out."""
+    if KNOWN_SCHEMAS.get(schema.name) == schema:
+        return schema.name
+    flip = [[i, f] for i, f in enumerate(schema.flip) if i < f]
+    return {"name": schema.name, "keypoints": list(schema.keypoints), "flip": flip}
+
+
+def read_schema(described: Any, path: Path) -> KeypointSchema:
+    """The inverse of `describe_schema`, checked; ``path`` is the file that holds it."""
+    if isinstance(described, str) and described in KNOWN_SCHEMAS:
+        return KNOWN_SCHEMAS[described]
     if not isinstance(described, dict) or not {"name", "keypoints"} <= described.keys():
+        known = ", ".join(map(repr, KNOWN_SCHEMAS))
         raise KroncError(
-            f"{path}: schema {described!r} is unknown: expected {APOLLOCAR3D_66.name!r} or "
+            f"{path}: schema {described!r} is unknown: expected {known} or "
             '{"name": ..., "keypoints": [...], "flip": [[i, j], ...]}'
         )
     flip = list(range(len(described["keypoints"])))
@@ -115,7 +120,7 @@ def _read_schema(described: Any, path: Path) -> KeypointSchema:
 
 
 def _read_own(path: Path, content: dict[str, Any]) -> Detections:
-    schema = _read_schema(content.get("schema"), path)
+    schema = read_schema(content.get("schema"), path)
     size = (int(content["width"]), int(content["height"])) if {"width", "height"} <= content.keys() else None
     frames: dict[str, np.ndarray] = {}
     for number, frame in enumerate(content["frames"]):
@@ -134,14 +139,28 @@ def _read_openpifpaf(folder: Path) -> Detections:
     files = sorted(folder.glob(f"*{suffix}"))
     if not files:
         raise KroncError(f"{folder} holds no keypoint file: expected {FORMATS}")
-    frames: dict[str, np.ndarray] = {}
-    for file in files:
-        content = read_json(file)
-        if not isinstance(content, list) or not all(isinstance(c, dict) and "keypoints" in c for c in content):
-            raise KroncError(f'{file}: expected a list of instances, each with "keypoints"')
-        instances = [_rows(instance["keypoints"], APOLLOCAR3D_66, str(file)) for instance in content]
-        frames[file.name.removesuffix(suffix)] = _shift_half_pixel(instances, len(APOLLOCAR3D_66))
-    return Detections(folder, APOLLOCAR3D_66, frames)
+    contents = {file: read_predictions(file) for file in files}
+    counts = (len(instance["keypoints"]) // 3 for instances in contents.values() for instance in instances)
+    schema = schema_of_count(next(counts, 66))
+    frames = {
+        file.name.removesuffix(suffix): openpifpaf_rows(instances, schema, file) for file, instances in contents.items()
+    }
+    return Detections(folder, schema, frames)
+
+
+def read_predictions(file: Path) -> list[dict[str, Any]]:
+    """The instances in one of OpenPifPaf's prediction files: each has "keypoints", three numbers a point."""
+    content = read_json(file)
+    if not isinstance(content, list) or not all(
+        isinstance(c, dict) and isinstance(c.get("keypoints"), list) for c in content
+    ):
+        raise KroncError(f'{file}: expected a list of instances, each with "keypoints"')
+    return content
+
+
+def openpifpaf_rows(instances: list[dict[str, Any]], schema: KeypointSchema, file: Path) -> Float[np.ndarray, "m j 3"]:
+    """(u, v, confidence) of each instance, in our pixels."""
+    return _shift_half_pixel([_rows(instance["keypoints"], schema, str(file)) for instance in instances], len(schema))
 
 
 def _read_coco(path: Path, content: dict[str, Any]) -> Detections:

@@ -142,3 +142,35 @@ APOLLOCAR3D_66 = KeypointSchema(
 
 Corner words in the names are partly the viewer's: trust ``left`` and ``flip``.
 """
+
+_OPENPIFPAF_24 = (
+    49, 8, 57, 0, 52, 5, 11, 7, 20, 23, 24, 33, 25, 32, 28, 29, 46, 34, 37, 50, 65, 64, 9, 48,
+)  # fmt: skip
+
+
+def _part(name: str, whole: KeypointSchema, indices: tuple[int, ...]) -> KeypointSchema:
+    """The points ``indices`` of a schema, in that order; they contain both of each pair."""
+    new = {old: i for i, old in enumerate(indices)}
+    return KeypointSchema(
+        name=name,
+        keypoints=tuple(whole.keypoints[old] for old in indices),
+        flip=tuple(new[whole.flip[old]] for old in indices),
+        left=tuple(new[old] for old in whole.left if old in new),
+        wheels=tuple(new[old] for old in whole.wheels if old in new),
+        skeleton=tuple((new[a], new[b]) for a, b in whole.skeleton if a in new and b in new),
+    )
+
+
+APOLLOCAR3D_24 = _part("apollocar3d-24", APOLLOCAR3D_66, _OPENPIFPAF_24)
+"""The 24 of them that OpenPifPaf's smaller car models find, in its order."""
+
+KNOWN_SCHEMAS = {schema.name: schema for schema in (APOLLOCAR3D_66, APOLLOCAR3D_24)}
+"""Schemas that files may call by name alone."""
+
+
+def schema_of_count(count: int) -> KeypointSchema:
+    """The known schema of so many points; otherwise points without names, of which none is another's mirror image."""
+    for schema in KNOWN_SCHEMAS.values():
+        if len(schema) == count:
+            return schema
+    return KeypointSchema(f"points-{count}", tuple(f"point_{j}" for j in range(count)), tuple(range(count)))

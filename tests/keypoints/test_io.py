@@ -5,7 +5,7 @@ import pytest
 
 from kronc_ns.errors import KroncError
 from kronc_ns.keypoints.io import read_keypoints, write_keypoints
-from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
+from kronc_ns.keypoints.schema import APOLLOCAR3D_24, APOLLOCAR3D_66, KeypointSchema
 
 
 def rows(seed: int, n: int = 66) -> np.ndarray:
@@ -43,6 +43,21 @@ def test_openpifpaf_folder(tmp_path):
     seen = uvc[:, 2] > 0
     np.testing.assert_allclose(read.frames["frame_00001.png"][0][seen, :2], uvc[seen, :2] + 0.5)  # pixel centres
     assert (read.frames["frame_00001.png"][0][~seen] == 0).all()
+
+
+def test_openpifpaf_files_of_the_24_point_model(tmp_path):
+    uvc = rows(4, 24)
+    (tmp_path / "a.png.predictions.json").write_text("[]")
+    (tmp_path / "b.png.predictions.json").write_text(json.dumps([{"keypoints": uvc.flatten().tolist()}]))
+    read = read_keypoints(tmp_path)
+    assert read.schema is APOLLOCAR3D_24
+    assert {name: found.shape for name, found in read.frames.items()} == {"a.png": (0, 24, 3), "b.png": (1, 24, 3)}
+
+
+def test_a_known_schema_is_written_by_name(tmp_path):
+    write_keypoints(tmp_path / "k.json", APOLLOCAR3D_24, (10, 10), {"x.png": rows(2, 24)})
+    assert json.loads((tmp_path / "k.json").read_text())["schema"] == "apollocar3d-24"
+    assert read_keypoints(tmp_path / "k.json").schema is APOLLOCAR3D_24
 
 
 def coco(labels, values) -> dict:

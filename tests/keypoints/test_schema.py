@@ -3,7 +3,7 @@ import json
 import pytest
 
 from kronc_ns.errors import KroncError
-from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
+from kronc_ns.keypoints.schema import APOLLOCAR3D_24, APOLLOCAR3D_66, KeypointSchema, schema_of_count
 from tests.conftest import SHARED_DATA
 
 
@@ -50,3 +50,24 @@ def test_schemas_that_do_not_pair_up_are_refused(flip):
 def test_fewer_than_four_points_are_refused():
     with pytest.raises(KroncError, match="at least 4"):
         KeypointSchema("x", ("a", "b", "c"), (0, 1, 2))
+
+
+def test_the_24_points_are_a_mirror_symmetric_part_of_the_66():
+    assert len(APOLLOCAR3D_24) == 24
+    for i, name in enumerate(APOLLOCAR3D_24.keypoints):
+        whole = APOLLOCAR3D_66.keypoints.index(name)
+        partner = APOLLOCAR3D_24.keypoints[APOLLOCAR3D_24.flip[i]]
+        assert partner == APOLLOCAR3D_66.keypoints[APOLLOCAR3D_66.flip[whole]]
+    assert len(APOLLOCAR3D_24.left) == 12
+    names = [APOLLOCAR3D_24.keypoints[i] for i in APOLLOCAR3D_24.wheels]
+    assert names == [APOLLOCAR3D_66.keypoints[i] for i in APOLLOCAR3D_66.wheels]
+
+
+def test_a_count_tells_a_known_schema():
+    assert schema_of_count(66) is APOLLOCAR3D_66
+    assert schema_of_count(24) is APOLLOCAR3D_24
+    other = schema_of_count(14)
+    assert len(other) == 14
+    assert other.flip == tuple(range(14))
+    with pytest.raises(KroncError, match="at least 4"):
+        schema_of_count(3)
