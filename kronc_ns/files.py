@@ -29,6 +29,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def cache_folder() -> Path:
+    """``$KRONC_NS_CACHE``, else the user's cache folder."""
+    chosen = os.environ.get("KRONC_NS_CACHE")
+    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "kronc_ns"
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically, with NaN refused rather than written as something JSON does not know."""
     text = json.dumps(content, indent=1, allow_nan=False)

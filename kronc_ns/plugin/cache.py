@@ -1,20 +1,14 @@
 """Solutions kept between runs, keyed by the content of what was solved; the user's own folder is never written."""
 
-import os
 from pathlib import Path
 from typing import Any
 
 from kronc_ns.errors import KroncError
 from kronc_ns.export import claim_output, write_solution
+from kronc_ns.files import cache_folder
 from kronc_ns.keypoints.io import read_json
 from kronc_ns.pipeline import KroncConfig, Progress, fingerprint, solve_scene
 from kronc_ns.scene import Scene
-
-
-def cache_folder() -> Path:
-    """``$KRONC_NS_CACHE``, else the user's cache folder."""
-    chosen = os.environ.get("KRONC_NS_CACHE")
-    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "kronc_ns"
 
 
 def read_report(folder: Path) -> dict[str, Any] | None:
