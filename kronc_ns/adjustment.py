@@ -17,7 +17,7 @@ from kronc_ns import objective
 from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.options import KroncConfig
-from kronc_ns.solve.lm import LmResult, adjust
+from kronc_ns.solve.lm import RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX, TRIM_SIGMAS, LmResult, adjust
 from kronc_ns.solve.problem import Problem, ShapePrior, State
 from kronc_ns.solve.uncertainty import camera_covariance
 from kronc_ns.starts import MIN_POINTS, Start, far_side, in_front, usable_views
@@ -161,7 +161,6 @@ def measured(
     initial_c2w: Float[Tensor, "n 3 4"],
     iterations: int,
     history: dict[str, list[float]],
-    config: KroncConfig,
 ) -> Attempt:
     """An attempt of another solver, with inliers and covariance as this one's have them."""
     scene = start.scene
@@ -169,8 +168,8 @@ def measured(
     error = (objective.reproject(start.points, start.c2w, scene.camera) - scene.uv).norm(dim=-1)
     error = torch.where(seen & in_front(start), error, math.inf)
     finite = error[error.isfinite()]
-    sigma_px = max(float(finite.median()) / 1.177, 0.05) if len(finite) else math.nan
-    inlier = error <= 4.5 * sigma_px
+    sigma_px = max(float(finite.median()) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX) if len(finite) else math.nan
+    inlier = error <= TRIM_SIGMAS * sigma_px
     covariance = torch.full((len(scene), 6, 6), math.nan, dtype=torch.float64)
     if inlier.any():
         known = replace(start, points=start.points.nan_to_num(0.0))

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import os
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -29,7 +30,7 @@ from kronc_ns.repair import repair
 from kronc_ns.scene import Scene
 from kronc_ns.solve.adam import AdamResult, minimise
 from kronc_ns.solve.solution import Solution, Status, ViewStatus
-from kronc_ns.solve.threads import one_thread
+from kronc_ns.solve.threads import one_thread, turn
 from kronc_ns.starts import Start, circles, start_from_poses, start_from_template, usable_views
 from kronc_ns.verify import Evidence, verify
 
@@ -68,8 +69,14 @@ def solve_scenes(
             return _solve_some(scenes, config, progress)
     groups = [scenes[first : first + _TOGETHER] for first in range(0, len(scenes), _TOGETHER)]
     outcome: list[Solution | KroncError] = []
+    lock = threading.Lock()
+
+    def solve(group: Sequence[Scene]) -> list[Solution | KroncError]:
+        with turn(lock):
+            return _solve_some(group, config, None)
+
     with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        for solutions in pool.map(lambda group: _solve_some(group, config, None), groups):
+        for solutions in pool.map(solve, groups):
             outcome += solutions
             if progress is not None:
                 progress(len(outcome), len(scenes), math.nan)
@@ -219,7 +226,7 @@ def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attem
     c2w = torch.full_like(initial, math.nan)
     if not usable.any():
         points = torch.full((len(scene.schema), 3), math.nan, dtype=torch.float64)
-        return measured(Start(name, scene, c2w, points, usable, torch.zeros_like(usable)), initial, 0, {}, config)
+        return measured(Start(name, scene, c2w, points, usable, torch.zeros_like(usable)), initial, 0, {})
     device = torch.device("cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu")
     result = _minimise(scene, config, initial, usable, given, device, progress)
     c2w[usable] = result.c2w.double().cpu()
@@ -230,7 +237,7 @@ def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attem
             "the optimisation diverged to values that are not finite: lower adam.learning_rate or mend the start"
         )
     start = Start(name, scene, c2w, points, usable, torch.zeros_like(usable))
-    return measured(start, initial, result.steps, result.history, config)
+    return measured(start, initial, result.steps, result.history)
 
 
 def _minimise(
@@ -289,6 +296,7 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig) -> Solution:
         sigma_rot_deg=variance[:, :3].sum(1).sqrt().rad2deg(),
         sigma_trans_m=variance[:, 3:].sum(1).sqrt() * placement.scale,
         swapped=start.swapped,
+        converged=attempt.converged,
         shape_weight=attempt.shape_weight if config.solver == "lm" and car_template(scene.schema) else None,
     )
     views, status, reason, rmse_px, median_px = verify(start.scene, solution, evidence)

@@ -152,5 +152,5 @@ def far_side(start: Start) -> Bool[Tensor, "n j"]:
     template = car_template(start.scene.schema)
     if template is None:
         return torch.zeros(len(start.scene), len(start.scene.schema), dtype=torch.bool)
-    ray = torch.nn.functional.normalize(start.c2w[:, None, :, 3] - start.points, dim=-1)
-    return (ray * template.normals).sum(-1) < AWAY
+    ray = start.c2w[:, None, :, 3] - start.points
+    return (ray * template.normals).sum(-1) < AWAY * ray.norm(dim=-1)

@@ -10,6 +10,7 @@ from torch import Tensor
 from kronc_ns import objective
 from kronc_ns.adjustment import agrees
 from kronc_ns.scene import Scene
+from kronc_ns.solve.lm import RAYLEIGH_MEDIAN
 from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
 from kronc_ns.starts import MIN_POINTS
 
@@ -18,6 +19,7 @@ INLIER_SIGMAS = 5.0
 """A detection counts as inlier up to this many robust standard deviations of all residuals."""
 POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
+_LEAST_SIGMA_PX = 0.1
 _VAGUE_DEG = 5.0
 """A median standard deviation of the rotations above this is close to degenerate."""
 _PARALLAX_DEG = 3.0
@@ -50,6 +52,8 @@ class Evidence:
     swapped: Bool[Tensor, "n"]
     shape_weight: float | None
     """How usual a car the points make, 1 to 0; None without a template."""
+    converged: bool
+    """Whether the solver came to rest within its steps."""
 
 
 def inliers(scene: Scene, solution: Solution) -> tuple[Float[Tensor, "n j"], Bool[Tensor, "n j"]]:
@@ -57,8 +61,7 @@ def inliers(scene: Scene, solution: Solution) -> tuple[Float[Tensor, "n j"], Boo
     error = residuals_px(scene, solution)
     measured = error[error.isfinite()]
     diagonal = math.hypot(scene.camera.width, scene.camera.height)
-    # the norm of 2D normal noise has its median at 1.177 sigma; never below a tenth of a pixel
-    sigma = max(float(measured.median()) / 1.177, 0.1) if len(measured) else math.inf
+    sigma = max(float(measured.median()) / RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX) if len(measured) else math.inf
     return error, error <= min(INLIER_SIGMAS * sigma, POOR_FIT * 3 * diagonal)
 
 
@@ -136,6 +139,8 @@ def _judge(
         return Status.FAILED, f"the keypoints do not fit together: {fit}, expected below {100 * POOR_FIT:g} %"
     vague = float(evidence.sigma_rot_deg[solved].nanmedian())
     problems = []
+    if not evidence.converged:
+        problems.append(f"the solver was still moving after {solution.iterations} steps: allow more")
     if count < MIN_VIEWS:
         problems.append(f"only {count} views: nothing but the car template holds them together")
     if share > POOR_FIT / 2:

@@ -164,14 +164,6 @@ def test_trouble_for_adam_ends_in_a_status(trouble, tmp_path):
     assert_says_what_it_is(solution, trouble, scene, tmp_path / "out")
 
 
-def test_a_solver_that_ran_out_of_steps_has_not_converged():
-    """On its way from the circle to one place, the residuals are small long before the end."""
-    scene = scene_with("one view again and again", PLAIN)
-    solution = solve_scene(scene, KroncConfig(init="circular", lm=LmConfig(iterations=60)))
-    assert solution.iterations == 60
-    assert solution.status is not Status.CONVERGED
-
-
 @pytest.mark.parametrize("views", [1, 2, 3, 4])
 @pytest.mark.parametrize("schema", [APOLLOCAR3D_66, PLAIN])
 def test_scenes_of_a_few_views_are_scenes(views, schema, tmp_path):

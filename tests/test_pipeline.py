@@ -281,6 +281,13 @@ def test_the_reason_says_where_it_started(scene, lap, lap_start):
     assert "start: circular" in solve_scene(scene, KroncConfig(init="circular", radius_m=5.0)).reason
 
 
+def test_a_solver_that_ran_out_of_steps_says_so(scene, lap_start):
+    config = KroncConfig(init="given", lm=LmConfig(iterations=3))
+    solution = solve_scene(replace(scene, given_c2w=lap_start), config)
+    assert solution.status is Status.WEAK
+    assert "still moving after 3 steps" in solution.reason
+
+
 def test_useless_given_poses_do_no_harm(scene, lap):
     elsewhere = lap.c2w[torch.from_numpy(np.random.default_rng(0).permutation(20))]
     solution = solve_scene(replace(scene, given_c2w=elsewhere))

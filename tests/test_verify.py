@@ -31,6 +31,7 @@ def evidence(views: int = 20, **changes) -> Evidence:
         "sigma_trans_m": torch.full((views,), 0.02, dtype=torch.float64),
         "swapped": torch.zeros(views, dtype=torch.bool),
         "shape_weight": 1.0,
+        "converged": True,
     }
     return Evidence(**{**known, **changes})
 
@@ -94,6 +95,7 @@ def view_of_another_car(scene: Scene, views: list[int]) -> Scene:
         ({}, {"shape_weight": None}, Status.CONVERGED, "20 of 20 views solved"),
         ({}, {"sigma_rot_deg": torch.full((20,), 8.0, dtype=torch.float64)}, Status.WEAK, "8.0 deg): take more views"),
         ({}, {"sigma_rot_deg": torch.full((20,), math.nan, dtype=torch.float64)}, Status.WEAK, "barely determined"),
+        ({}, {"converged": False}, Status.WEAK, "still moving after"),
         ({"blur": 3.5}, {}, Status.WEAK, "fit poorly"),
         ({"blur": 12.0}, {}, Status.FAILED, "do not fit together"),
         ({"odd": list(range(3))}, {}, Status.CONVERGED, "17 of 20 views solved"),

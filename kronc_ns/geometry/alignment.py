@@ -44,7 +44,7 @@ def umeyama(
         return Similarity(torch.ones_like(variance), identity, mean_target - mean_source)
     u, singular, vh = torch.linalg.svd(centred_target.T @ (share * centred_source))
     sign = torch.ones_like(singular)
-    sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))
+    sign[2] = torch.sign(torch.linalg.det(u @ vh))
     rotation = (u * sign) @ vh
     scale = (singular * sign).sum() / variance
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)

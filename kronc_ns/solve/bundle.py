@@ -15,6 +15,7 @@ from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.solve import lm_cpu
 from kronc_ns.solve.lm_cpu import BEHIND_PX, NEAR, TINY
 from kronc_ns.solve.problem import OrbitPrior, Problem, Residuals, ShapePrior, State, focal_of
+from kronc_ns.solve.threads import aside
 
 
 def residuals(problem: Problem, state: State) -> Residuals:
@@ -183,7 +184,9 @@ def reduce_system(
     shape = problem.shape or ShapePrior.nothing(problem.uv)
     given = (state.rotation, state.translation, state.points, problem.uv, problem.weight, weight, problem.focal)
     given = (*given, damping, variance * shape_weight, shape.mean, shape.precision)
-    lm_cpu.reduce_scenes(*(x.contiguous().numpy() for x in (*given, whitener, whitened, matrix, rhs)))
+    arrays = [x.contiguous().numpy() for x in (*given, whitener, whitened, matrix, rhs)]
+    with aside():
+        lm_cpu.reduce_scenes(*arrays)
     return Reduced(whitener, whitened.flatten(1, 2), matrix, rhs)
 
 

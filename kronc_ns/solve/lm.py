@@ -33,6 +33,7 @@ from kronc_ns.solve.lm_cpu import (
     TRIMMED,
 )
 from kronc_ns.solve.problem import Batched, Problem, Residuals, ShapePrior, State
+from kronc_ns.solve.threads import aside
 
 _HUBER_SIGMAS = 2.0
 
@@ -115,7 +116,7 @@ def _adjust_compiled(
     shape = problem.shape or ShapePrior.nothing(problem.uv)
     given = (problem.uv, problem.weight, problem.focal, _redundancy(problem))
     most = sigma.new_full((scenes,), math.inf) if most_sigma_px is None else most_sigma_px
-    lm_cpu.adjust_scenes(
+    arguments = (
         *(x.numpy() for x in (state.rotation, state.translation, state.points)),
         *(x.contiguous().numpy() for x in (*given, most, shape.mean, shape.precision)),
         shape.freedom,
@@ -124,6 +125,8 @@ def _adjust_compiled(
         config.tolerance,
         *(x.numpy() for x in (sigma, cost, shape_weight, steps, converged, inlier, losses)),
     )
+    with aside():
+        lm_cpu.adjust_scenes(*arguments)
     detections = max(1, int((problem.weight[:1] > 0).sum()))
     loss = (losses[: int(steps[0]) if scenes else 0] / detections).sqrt().tolist()
     history = {"step": [float(step) for step in range(1, len(loss) + 1)], "loss": loss}

@@ -231,8 +231,11 @@ def _cost(norm: Any, sigma: Any, phase: Any, surprise: Any, freedom: Any, size: 
     total = 0.0
     if phase == ROBUST:
         scale = CAUCHY_SIGMAS * CAUCHY_SIGMAS * sigma * sigma
-        for k in range(len(norm)):
-            total += np.log1p(norm[k] * norm[k] / scale)
+        for begin in range(0, len(norm), 8):  # one logarithm for eight: their product cannot overflow
+            product = 1.0
+            for k in range(begin, min(begin + 8, len(norm))):
+                product *= 1.0 + norm[k] * norm[k] / scale
+            total += np.log(product)
         total *= scale
     else:
         most = TRIM_SIGMAS * TRIM_SIGMAS * sigma * sigma

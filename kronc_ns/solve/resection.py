@@ -64,14 +64,10 @@ def locate(
         w2c = torch.cat([w2c, sampled[:, None]], dim=1)
         w2c = _refined(w2c, points, uv, weight, focal, tolerance_px / 3)
     views, guesses = w2c.shape[:2]
-
-    def each(x: Tensor) -> Tensor:
-        return x.repeat_interleave(guesses, dim=0)
-
-    problem = Problem(each(uv)[:, None], each(weight)[:, None], each(focal), points_known=True)
-    state = State.of(invert(w2c.flatten(0, 1))[:, None], each(points))
+    problem, state = _posed(w2c, points, uv, weight, focal)
+    tolerance = tolerance_px.repeat_interleave(guesses)
     norm = residuals(problem, state).norm[:, 0]
-    cost = unexplained(norm, each(weight), state.c2w[:, 0], each(points), each(tolerance_px), normals)
+    cost = unexplained(norm, problem.weight[:, 0], state.c2w[:, 0], state.points, tolerance, normals)
     cost = cost.view(views, guesses)
     best = cost.nan_to_num(math.inf).argmin(dim=1)
     return Located(w2c[torch.arange(views), best], cost[torch.arange(views), best])
@@ -87,18 +83,26 @@ def _refined(
 ) -> Float[Tensor, "m g 3 4"]:
     """Every guess after robust least squares, with a known noise or else one that follows the residuals down."""
     views, guesses = w2c.shape[:2]
-    problem, start = (
-        Problem(
-            uv.repeat_interleave(guesses, dim=0)[:, None],
-            weight.repeat_interleave(guesses, dim=0)[:, None],
-            focal.repeat_interleave(guesses, dim=0),
-            points_known=True,
-        ),
-        State.of(invert(w2c.flatten(0, 1))[:, None], points.repeat_interleave(guesses, dim=0)),
-    )
+    problem, start = _posed(w2c, points, uv, weight, focal)
     most = None if sigma_px is None else sigma_px.repeat_interleave(guesses, dim=0)
     found = adjust(problem, start, LmConfig(iterations=15, tolerance=1e-3), most_sigma_px=most).state
     return make_pose(found.rotation, found.translation)[:, 0].view(views, guesses, 3, 4)
+
+
+def _posed(
+    w2c: Float[Tensor, "m g 3 4"],
+    points: Float[Tensor, "m j 3"],
+    uv: Float[Tensor, "m 2 j"],
+    weight: Float[Tensor, "m j"],
+    focal: Float[Tensor, "m 2"],
+) -> tuple[Problem, State]:
+    """Every guess of every view as a scene of its own."""
+
+    def each(x: Tensor) -> Tensor:
+        return x.repeat_interleave(w2c.shape[1], dim=0)
+
+    problem = Problem(each(uv)[:, None], each(weight)[:, None], each(focal), points_known=True)
+    return problem, State.of(invert(w2c.flatten(0, 1))[:, None], each(points))
 
 
 def unexplained(

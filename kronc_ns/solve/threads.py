@@ -1,9 +1,12 @@
-"""How many CPU threads a solver takes."""
+"""How a solver uses the threads of the CPU."""
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+
+_local = threading.local()
 
 
 @contextmanager
@@ -15,3 +18,32 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextmanager
+def turn(lock: threading.Lock) -> Iterator[None]:
+    """Compute in this thread only while holding ``lock``, but for what is done `aside`.
+
+    Threads that run small tensor operations at the same time hand the interpreter back and forth at every one of them
+    and are slower together than one after the other.
+    """
+    _local.lock = lock
+    try:
+        with lock:
+            yield
+    finally:
+        del _local.lock
+
+
+@contextmanager
+def aside() -> Iterator[None]:
+    """A compiled loop, which needs no interpreter: meanwhile another thread may have its `turn`."""
+    lock = getattr(_local, "lock", None)
+    if lock is None:
+        yield
+        return
+    lock.release()
+    try:
+        yield
+    finally:
+        lock.acquire()

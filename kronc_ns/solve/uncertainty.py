@@ -7,7 +7,9 @@ from torch import Tensor
 from kronc_ns.geometry.rotations import skew
 from kronc_ns.solve.bundle import reduce_system
 from kronc_ns.solve.problem import Problem, State
+from kronc_ns.solve.threads import aside
 
+_TRACE = 1e-9
 _DAMPING = 1e-9  # keeps the gauge's zero pivots positive
 
 
@@ -37,7 +39,8 @@ def camera_covariance(
     factor = torch.linalg.cholesky_ex(matrix).L
     # A camera follows the points by -W^T Y, and the gauge's part of their error, motion gauge^T, is taken off it. With
     # Z = Y L^-T and G = L^-1 gauge its covariance is W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T.
-    z = torch.linalg.solve_triangular(factor.mT, reduced.whitened[..., :size], upper=True, left=False)
+    with aside():
+        z = torch.linalg.solve_triangular(factor.mT, reduced.whitened[..., :size], upper=True, left=False)
     g = torch.linalg.solve_triangular(factor, gauge, upper=False)
     mixed, z = (z @ g).view(b, n, 6, 7), z.view(b, n, 6, size)
     own = z @ z.mT + torch.eye(6, dtype=z.dtype, device=z.device)
@@ -64,7 +67,6 @@ def _gauge(
     moves = torch.cat([shift, turn, arm[..., None]], dim=-1)  # [b, j, 3, 7]
     flat = torch.zeros(b, size, 7, dtype=dtype, device=state.points.device)
     flat[:, : 3 * j] = moves.transpose(1, 2).flatten(1, 2)
-    basis, upper = torch.linalg.qr(flat)
     # What leaves all images as they are when the world shifts by s, turns by w and grows by g about the mean m:
     # with a = R m + t the camera turns by -R w and moves by g a - [a] R w - R s, all in camera axes.
     at = state.rotation @ mean[..., None] + state.translation[..., None]
@@ -76,5 +78,8 @@ def _gauge(
         ],
         dim=-2,
     )
-    # flat = basis upper, so coefficients of the basis are upper times those of the moves
-    return basis, moved @ torch.linalg.pinv(upper)[:, None]
+    # orthonormal: flat upper^-1, with flat^T flat = upper^T upper; a trace of the identity where points are too few
+    square = flat.mT @ flat
+    square.diagonal(dim1=-2, dim2=-1).add_(_TRACE)
+    inverse = torch.linalg.inv(torch.linalg.cholesky(square, upper=True))
+    return flat @ inverse, moved @ inverse[:, None]
