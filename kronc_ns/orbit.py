@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from kronc_ns.geometry.poses import compose, invert, look_at, make_pose
@@ -75,6 +74,8 @@ def _between(
     index: Float[Tensor, "k"], c2w: Float[Tensor, "k 3 4"], wanted: Float[Tensor, "w"]
 ) -> Float[Tensor, "w 3 4"]:
     """Interpolated poses: azimuth, distance and height; and the turn away from facing the axis."""
+    from scipy.interpolate import PchipInterpolator  # half a second of import that few captures need
+
     aim = so3_log(compose(invert(_facing(c2w[..., 3])), c2w)[..., :3])
     curves = torch.cat([torch.stack(_cylinder(c2w), dim=1), aim], dim=1)
     inside = wanted.clamp(index[0], index[-1])

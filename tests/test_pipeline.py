@@ -35,6 +35,7 @@ def noisy(walk_capture) -> Scene:
     return scene_of(walk_capture, noisy_poses(walk_capture.c2w, 4.0, 0.5, torch.Generator().manual_seed(0)))
 
 
+@pytest.mark.slow
 def test_solving_from_noisy_poses(noisy, walk_capture):
     solution = solve_scene(noisy, QUICK)
     assert solution.status is Status.CONVERGED
@@ -52,6 +53,7 @@ def test_solving_from_noisy_poses(noisy, walk_capture):
     torch.testing.assert_close(to_given.translation, torch.zeros(3, dtype=torch.float64), atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 def test_solving_from_the_circle_stands_the_car_upright(walk_capture):
     solution = solve_scene(
         scene_of(walk_capture), replace(QUICK, radius_m=5.0, adam=AdamConfig(steps=1500, learning_rate=0.03))
@@ -86,6 +88,7 @@ def test_adam_which_tries_one_circle_only_hints_at_the_direction_too(walk_captur
     assert "other way" in solution.reason
 
 
+@pytest.mark.slow
 def test_a_poor_view_is_left_out_and_the_others_do_not_suffer(noisy, walk_capture):
     keypoints = noisy.keypoints.clone()
     keypoints[5, torch.nonzero(keypoints[5, :, 2])[3:, 0]] = 0  # three points left
@@ -104,6 +107,7 @@ def test_a_poor_view_is_left_out_and_the_others_do_not_suffer(noisy, walk_captur
     assert pose_errors(whole.c2w, walk_capture.c2w)[0][5] < 6.0
 
 
+@pytest.mark.slow
 def test_a_view_of_another_car_is_found_out(noisy):
     keypoints = noisy.keypoints.clone()
     seen = torch.nonzero(keypoints[5, :, 2])[:, 0]
@@ -125,6 +129,7 @@ def test_same_seed_same_bits_and_the_seed_matters(noisy):
     assert not torch.equal(first, other)
 
 
+@pytest.mark.slow
 def test_given_depths_speed_up_and_can_be_fixed(noisy, walk_capture):
     from kronc_ns.geometry.poses import invert, transform
 
@@ -316,7 +321,9 @@ def test_given_poses_keep_their_frame_and_scale(scene, lap, lap_start):
     assert float((sigma / metres).median()) == pytest.approx(0.4, rel=0.05)
 
 
-@pytest.mark.parametrize(("solver", "given"), [("lm", False), ("lm", True), ("adam", False)])
+@pytest.mark.parametrize(
+    ("solver", "given"), [("lm", False), ("lm", True), pytest.param("adam", False, marks=pytest.mark.slow)]
+)
 def test_the_cars_length_sets_the_scale(scene, lap_start, solver, given):
     config = replace(QUICK, solver=solver, car_length_m=5.5, radius_m=5.0)
     given_c2w = lap_start if given else None
