@@ -19,6 +19,7 @@ with jaxtyping.install_import_hook(
         "kronc_ns.solve.solution",
         "kronc_ns.solve.uncertainty",
         "kronc_ns.keypoints",
+        "kronc_ns.capture.detection",
         "kronc_ns.frame",
         "kronc_ns.orbit",
         "kronc_ns.starts",
