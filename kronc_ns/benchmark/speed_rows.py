@@ -39,7 +39,7 @@ def speed_tasks(options: Options) -> list[Task]:
         Task(
             "against pycolmap's bundle adjustment (Ceres)",
             "not slower than the fastest of its settings",
-            f"{_CAPTURE}, 100 views; solve_scene in whole, pycolmap without building its model",
+            f"{_CAPTURE}, 100 views; either adjustment alone, models being built; solve_scene in whole beside",
             20,
             measures.against_ceres,
             measures.judge_ceres,

@@ -12,10 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from kronc_ns.geometry.rotations import so3_exp
-from kronc_ns.solve import lm_cpu
 from kronc_ns.solve.lm_cpu import BEHIND_PX, NEAR, TINY
-from kronc_ns.solve.problem import OrbitPrior, Problem, Residuals, ShapePrior, State, focal_of
-from kronc_ns.solve.threads import aside
+from kronc_ns.solve.problem import OrbitPrior, Problem, Residuals, State, focal_of
 
 
 def residuals(problem: Problem, state: State) -> Residuals:
@@ -164,30 +162,6 @@ class Reduced:
     matrix: Float[Tensor, "b p p"]
     """Symmetric; only the lower triangle is sure to be there."""
     rhs: Float[Tensor, "b p"]
-
-
-def reduce_system(
-    problem: Problem,
-    state: State,
-    weight: Float[Tensor, "b n j"],
-    variance: Float[Tensor, "b"],
-    shape_weight: Float[Tensor, "b"],
-    damping: Float[Tensor, "b"],
-) -> Reduced:
-    """`linearise` and `eliminate_cameras`; compiled where that serves."""
-    if not problem.plain:
-        system = linearise(problem, state, residuals(problem, state), weight, variance, shape_weight)
-        return eliminate_cameras(system, damping)
-    b, n, _, j = problem.uv.shape
-    whitener, whitened = problem.uv.new_empty(b, n, 6, 6), problem.uv.new_zeros(b, n, 6, 3 * j + 1)
-    matrix, rhs = problem.uv.new_zeros(b, 3 * j, 3 * j), problem.uv.new_empty(b, 3 * j)
-    shape = problem.shape or ShapePrior.nothing(problem.uv)
-    given = (state.rotation, state.translation, state.points, problem.uv, problem.weight, weight, problem.focal)
-    given = (*given, damping, variance * shape_weight, shape.mean, shape.precision)
-    arrays = [x.contiguous().numpy() for x in (*given, whitener, whitened, matrix, rhs)]
-    with aside():
-        lm_cpu.reduce_scenes(*arrays)
-    return Reduced(whitener, whitened.flatten(1, 2), matrix, rhs)
 
 
 def eliminate_cameras(system: Linearisation, damping: Float[Tensor, "b"]) -> Reduced:

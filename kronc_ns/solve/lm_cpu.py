@@ -73,38 +73,127 @@ def adjust_scenes(
 
 
 @compiled
-def reduce_scenes(
+def camera_covariances(
     rotation: Any,  # [B, N, 3, 3]
     translation: Any,  # [B, N, 3]
     points: Any,  # [B, J, 3]
     uv: Any,  # [B, N, 2, J]
-    own: Any,  # [B, N, J], the detections' own weights
-    irls: Any,  # [B, N, J]
+    weight: Any,  # [B, N, J], 0 for outliers
     focal: Any,  # [B, 2]
-    damping: Any,  # [B]
+    damping: Any,
+    variance: Any,  # [B], of the inliers
     strength: Any,  # [B], weight of the shape prior
-    mean: Any,  # [3J] of the shape prior
     precision: Any,  # [3J, 3J] of the shape prior; [0, 0] without one
-    whitener: Any,  # out [B, N, 6, 6]
-    whitened: Any,  # out [B, N, 6, 3J + 1], zeros
-    matrix: Any,  # out [B, 3J, 3J], lower triangle
-    rhs: Any,  # out [B, 3J]
+    trace: Any,
+    covariance: Any,  # out [B, N, 6, 6]
 ) -> None:
-    """`bundle.reduce_system` of every scene."""
-    pull = np.zeros(rhs.shape[1])
+    """`uncertainty.camera_covariance` of every scene."""
+    views, size = rotation.shape[1], 3 * points.shape[1]
+    matrix, rhs, pull = np.empty((size, size)), np.empty(size), np.zeros(size)
+    whitener, whitened = np.empty((views, 6, 6)), np.empty((views, 6, size + 1))
     for b in range(len(uv)):
-        first, joint, measured, weight = detections(uv[b], own[b])
+        first, joint, measured, own = detections(uv[b], weight[b])
         seen, error, norm = np.empty((len(joint), 3)), np.empty((len(joint), 2)), np.empty(len(joint))
-        project(rotation[b], translation[b], points[b], first, joint, measured, weight, focal[b], seen, error, norm)
-        for n in range(len(first) - 1):
-            for k in range(first[n], first[n + 1]):
-                weight[k] *= irls[b, n, joint[k]]
-        if len(precision):
-            _surprise(points[b], mean, precision, pull)
+        project(rotation[b], translation[b], points[b], first, joint, measured, own, focal[b], seen, error, norm)
+        whitened[:] = 0.0
         reduce_system(
-            rotation[b], first, joint, seen, error, weight, focal[b], damping[b], strength[b], precision, pull,
-            whitener[b], whitened[b], matrix[b], rhs[b],
+            rotation[b], first, joint, seen, error, own, focal[b], damping, strength[b], precision, pull,
+            whitener, whitened, matrix, rhs,
         )  # fmt: skip
+        gauge, inverse, mean = _gauge(points[b], joint, trace)
+        stiffness = 0.0
+        for i in range(size):
+            stiffness += matrix[i, i] / size
+        for i in range(size):
+            for p in range(7):
+                factor = stiffness * gauge[p, i]
+                for k in range(i + 1):
+                    matrix[i, k] += factor * gauge[p, k]
+        if not _factor(matrix):
+            covariance[b] = np.nan
+            continue
+        _forward(matrix, gauge)
+        for n in range(views):
+            z = whitened[n]
+            _forward(matrix, z)
+            _camera_covariance(
+                rotation[b, n], translation[b, n], mean, whitener[n], z, gauge, inverse, variance[b], covariance[b, n]
+            )
+
+
+@compiled
+def _gauge(points: Any, joint: Any, trace: Any) -> Any:
+    """Orthonormal directions [8, 3J] in which shift, turn and growth of the world move the points that are seen.
+
+    (The last is 0 and makes the count even.) Also the 7x7 matrix that makes them of the moves, and the points' mean.
+    """
+    joints = len(points)
+    moves, square, inverse, mean = np.zeros((8, 3 * joints)), np.empty((7, 7)), np.empty((7, 7)), np.zeros(3)
+    seen = np.zeros(joints)
+    seen[joint] = 1.0
+    for j in range(joints):
+        for c in range(3):
+            mean[c] += seen[j] * points[j, c] / max(seen.sum(), 1.0)
+    for j in range(joints):
+        if seen[j] > 0.0:
+            x, y, z = points[j, 0] - mean[0], points[j, 1] - mean[1], points[j, 2] - mean[2]
+            for c in range(3):
+                moves[c, c * joints + j] = 1.0
+            moves[3, joints + j], moves[3, 2 * joints + j] = -z, y
+            moves[4, j], moves[4, 2 * joints + j] = z, -x
+            moves[5, j], moves[5, joints + j] = -y, x
+            moves[6, j], moves[6, joints + j], moves[6, 2 * joints + j] = x, y, z
+    for p in range(7):
+        for q in range(7):
+            square[p, q] = _dot(moves[p], moves[q], 3 * joints)
+        square[p, p] += trace
+    _inverse_factor(square, inverse)
+    for p in range(6, -1, -1):
+        for i in range(3 * joints):
+            moves[p, i] *= inverse[p, p]
+        for q in range(p):
+            for i in range(3 * joints):
+                moves[p, i] += inverse[p, q] * moves[q, i]
+    return moves, inverse, mean
+
+
+@compiled
+def _camera_covariance(
+    r: Any, t: Any, mean: Any, whitener: Any, z: Any, gauge: Any, inverse: Any, variance: Any, out: Any
+) -> None:
+    """One camera's: W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T, see `uncertainty`."""
+    size = gauge.shape[1]
+    moved, outer, inner, half = np.zeros((6, 7)), np.zeros((6, 13)), np.zeros((13, 13)), np.empty((6, 13))
+    at = np.empty(3)
+    for p in range(3):
+        at[p] = r[p, 0] * mean[0] + r[p, 1] * mean[1] + r[p, 2] * mean[2] + t[p]
+    for p in range(3):
+        a, b = (p + 1) % 3, (p + 2) % 3
+        for c in range(3):
+            moved[p, 3 + c] = -r[p, c]
+            moved[3 + p, c] = -r[p, c]
+            moved[3 + p, 3 + c] = at[b] * r[a, c] - at[a] * r[b, c]
+        moved[3 + p, 6] = at[p]
+    for p in range(6):
+        for q in range(6):
+            outer[p, q] = whitener[q, p]
+            inner[p, q] = _dot(z[p], z[q], size)
+        inner[p, p] += 1.0
+        for q in range(7):
+            inner[p, 6 + q] = inner[6 + q, p] = _dot(z[p], gauge[q], size)
+            for k in range(q + 1):
+                outer[p, 6 + q] += moved[p, k] * inverse[q, k]
+    for p in range(7):
+        for q in range(7):
+            inner[6 + p, 6 + q] = _dot(gauge[p], gauge[q], size)
+    for p in range(6):
+        for q in range(13):
+            half[p, q] = _dot(outer[p], inner[q], 13)
+    for p in range(6):
+        for q in range(6):
+            # the centre moves by -v (in camera axes) when the translation grows by v
+            sign = -1.0 if (p < 3) != (q < 3) else 1.0
+            out[p, q] = sign * variance * _dot(half[p], outer[q], 13)
 
 
 @compiled
@@ -506,15 +595,16 @@ def _exponential(w: Any, out: Any) -> None:
 
 @compiled
 def _inverse_factor(matrix: Any, out: Any) -> None:
-    """Inverse of the lower Cholesky factor of a 6x6 matrix (lower triangle), which is destroyed."""
-    for i in range(6):
+    """Inverse of the lower Cholesky factor of a small matrix (lower triangle), which is destroyed."""
+    size = len(matrix)
+    for i in range(size):
         for j in range(i + 1):
             total = matrix[i, j]
             for k in range(j):
                 total -= matrix[i, k] * matrix[j, k]
             matrix[i, j] = np.sqrt(total) if i == j else total / matrix[j, j]
-    for j in range(6):
-        for i in range(6):
+    for j in range(size):
+        for i in range(size):
             if i < j:
                 out[i, j] = 0.0
                 continue
@@ -525,9 +615,9 @@ def _inverse_factor(matrix: Any, out: Any) -> None:
 
 
 @compiled
-def _solve(matrix: Any, rhs: Any) -> Any:
-    """Solve in place by Cholesky's factors of the lower triangle; False where it is not positive definite."""
-    size = len(rhs)
+def _factor(matrix: Any) -> Any:
+    """Cholesky's factor in place of the lower triangle; False where it is not positive definite."""
+    size = len(matrix)
     for j in range(size):
         row = matrix[j]
         total = row[j]
@@ -558,6 +648,15 @@ def _solve(matrix: Any, rhs: Any) -> Any:
                 total -= matrix[i, k] * row[k]
             matrix[i, j] = total * inverse
             i += 1
+    return True
+
+
+@compiled
+def _solve(matrix: Any, rhs: Any) -> Any:
+    """Solve in place by Cholesky's factors; False where the matrix is not positive definite."""
+    if not _factor(matrix):
+        return False
+    size = len(rhs)
     for i in range(size):
         for k in range(i):
             rhs[i] -= matrix[i, k] * rhs[k]
@@ -567,3 +666,18 @@ def _solve(matrix: Any, rhs: Any) -> Any:
         for k in range(i):
             rhs[k] -= matrix[i, k] * rhs[i]
     return True
+
+
+@compiled
+def _forward(factor: Any, rows: Any) -> None:
+    """Every row x of an even number becomes the solution y of ``factor`` y = x; entries past its size stay."""
+    for p in range(0, len(rows), 2):
+        x, y = rows[p], rows[p + 1]
+        for i in range(len(factor)):
+            row = factor[i]
+            s = t = 0.0
+            for k in range(i):
+                s += row[k] * x[k]
+                t += row[k] * y[k]
+            x[i] = (x[i] - s) / row[i]
+            y[i] = (y[i] - t) / row[i]

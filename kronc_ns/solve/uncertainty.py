@@ -5,8 +5,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from kronc_ns.geometry.rotations import skew
-from kronc_ns.solve.bundle import reduce_system
-from kronc_ns.solve.problem import Problem, State
+from kronc_ns.solve import lm_cpu
+from kronc_ns.solve.bundle import eliminate_cameras, linearise, residuals
+from kronc_ns.solve.problem import Problem, ShapePrior, State
 from kronc_ns.solve.threads import aside
 
 _TRACE = 1e-9
@@ -26,11 +27,32 @@ def camera_covariance(
     what remains is the camera's error relative to the object. Cameras without detections get what the system knows of
     them: nothing (a huge covariance).
     """
-    b, n, _ = inlier.shape
-    seen = (inlier & (problem.weight > 0)).any(1)
-    weight, variance = inlier.to(problem.weight.dtype), sigma_px.square()
-    damping = torch.full_like(sigma_px, _DAMPING)
-    reduced = reduce_system(problem, state, weight, variance, shape_weight, damping)
+    weight = torch.where(inlier, problem.weight, 0.0)
+    compute = _compiled if problem.plain else _dense
+    return compute(problem, state, weight, sigma_px.square(), shape_weight)
+
+
+def _compiled(
+    problem: Problem, state: State, weight: Tensor, variance: Tensor, shape_weight: Tensor
+) -> Float[Tensor, "b n 6 6"]:
+    covariance = weight.new_empty(*weight.shape[:2], 6, 6)
+    shape = problem.shape or ShapePrior.nothing(weight)
+    tensors = (state.rotation, state.translation, state.points, problem.uv, weight, problem.focal)
+    given = [x.contiguous().numpy() for x in tensors]
+    prior = [x.contiguous().numpy() for x in (variance, variance * shape_weight, shape.precision)]
+    with aside():
+        lm_cpu.camera_covariances(*given, _DAMPING, *prior, _TRACE, covariance.numpy())
+    return covariance
+
+
+def _dense(
+    problem: Problem, state: State, weight: Tensor, variance: Tensor, shape_weight: Tensor
+) -> Float[Tensor, "b n 6 6"]:
+    b, n, _ = weight.shape
+    seen = (weight > 0).any(1)
+    chosen = (weight > 0).to(weight.dtype)
+    system = linearise(problem, state, residuals(problem, state), chosen, variance, shape_weight)
+    reduced = eliminate_cameras(system, torch.full_like(variance, _DAMPING))
     size = reduced.rhs.shape[1]
     gauge, motion = _gauge(state, seen, size)
     # any generalised inverse will do, since the gauge is projected out below; a stiff spring makes the matrix regular
@@ -39,15 +61,14 @@ def camera_covariance(
     factor = torch.linalg.cholesky_ex(matrix).L
     # A camera follows the points by -W^T Y, and the gauge's part of their error, motion gauge^T, is taken off it. With
     # Z = Y L^-T and G = L^-1 gauge its covariance is W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T.
-    with aside():
-        z = torch.linalg.solve_triangular(factor.mT, reduced.whitened[..., :size], upper=True, left=False)
+    z = torch.linalg.solve_triangular(factor.mT, reduced.whitened[..., :size], upper=True, left=False)
     g = torch.linalg.solve_triangular(factor, gauge, upper=False)
     mixed, z = (z @ g).view(b, n, 6, 7), z.view(b, n, 6, size)
     own = z @ z.mT + torch.eye(6, dtype=z.dtype, device=z.device)
     shared = (g.mT @ g)[:, None].expand(b, n, 7, 7)
     inner = torch.cat([torch.cat([own, mixed], -1), torch.cat([mixed.mT, shared], -1)], -2)
     outer = torch.cat([reduced.whitener.mT, motion], -1)
-    covariance = (outer @ inner @ outer.mT) * sigma_px.square()[:, None, None, None]
+    covariance = (outer @ inner @ outer.mT) * variance[:, None, None, None]
     # the centre moves by -v (in camera axes) when the translation grows by v
     sign = covariance.new_tensor([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     return covariance * sign[:, None] * sign

@@ -14,7 +14,6 @@ from kronc_ns.solve.bundle import (
     linearise,
     move,
     orbit_error,
-    reduce_system,
     residuals,
     solve_step,
 )
@@ -165,23 +164,6 @@ def test_errors_are_projections_less_detections_where_something_is_seen(variant)
     expected = torch.where(seen[:, :, None], reprojection(problem, state), 0.0)
     torch.testing.assert_close(found.error, expected, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(found.norm, (expected.square().sum(2) * problem.weight).sqrt(), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_the_short_cut_to_the_reduced_system_is_no_other_system(variant):
-    """Compiled for the CPU where that serves: what it leaves out are zeros."""
-    problem, state, weight, _ = systems(variant, batch=3)
-    problem.weight[0, 2], problem.weight[1, :, 4] = 0, 0
-    damping = torch.tensor([1e-3, 1.0, 10.0], dtype=torch.float64)
-    ones = torch.ones(3, dtype=torch.float64)
-    factors = (weight, VARIANCE * ones, SHAPE_WEIGHT * ones)
-    short = reduce_system(problem, state, *factors, damping)
-    long = eliminate_cameras(linearise(problem, state, residuals(problem, state), *factors), damping)
-    for ours, theirs in zip(vars(short).values(), vars(long).values(), strict=True):
-        ours, theirs = (x.tril() if x is short.matrix or x is long.matrix else x for x in (ours, theirs))
-        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-7)
-    for ours, theirs in zip(*(vars(solve_step(x, JOINTS)).values() for x in (short, long)), strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-7, atol=1e-10)
 
 
 def test_a_damped_step_lowers_the_cost():

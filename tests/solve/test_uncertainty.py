@@ -10,7 +10,7 @@ from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.geometry.rotations import so3_log
 from kronc_ns.solve.bundle import residuals
 from kronc_ns.solve.lm import LmConfig, adjust
-from kronc_ns.solve.problem import Problem, ShapePrior, State
+from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State
 from kronc_ns.solve.uncertainty import camera_covariance
 from tests.solve.problems import SIMILARITY, moved, randn, scene
 
@@ -143,3 +143,19 @@ def test_a_view_with_too_few_points_for_a_pose_is_no_trouble_to_the_others(count
     assert (thin[kept].diagonal(dim1=1, dim2=2) > 0.9 * whole[kept].diagonal(dim1=1, dim2=2)).all()
     assert (thin[kept].diagonal(dim1=1, dim2=2) < 3 * whole[kept].diagonal(dim1=1, dim2=2)).all()
     assert thin[4].diagonal().max() > 3 * whole[4].diagonal().max()
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_the_compiled_covariances_are_those_of_the_tensors(with_prior):
+    """An orbit that expects nothing keeps a problem from being compiled and changes nothing else."""
+    problem, truth = scene(7, 12, 3, noise_px=1.0)
+    problem.weight[0, 2], problem.weight[1, :, 4] = 0, 0
+    inlier = (problem.weight > 0) & (randn(*problem.weight.shape, seed=3) < 1.5)
+    if with_prior:
+        root = randn(36, 36, seed=4)
+        problem = replace(problem, shape=ShapePrior.of(truth.points[0], root @ root.T / 12))
+    sigma, shape_weight = 0.5 + randn(2, 3, seed=5).abs()
+    nowhere = OrbitPrior(truth.c2w[..., 3], torch.full(inlier.shape[:2], torch.inf, dtype=torch.float64))
+    ours = camera_covariance(problem, truth, inlier, sigma, shape_weight)
+    theirs = camera_covariance(replace(problem, orbit=nowhere), truth, inlier, sigma, shape_weight)
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-9)
