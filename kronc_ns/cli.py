@@ -14,6 +14,7 @@ from rich.table import Table
 
 from kronc_ns.batch import expand, solve_folders
 from kronc_ns.benchmark.command import Bench
+from kronc_ns.capture.detection.conversion import ConvertDetector
 from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, metrics_table, progress_bar, report_table
 from kronc_ns.errors import KroncError
@@ -207,6 +208,7 @@ Command = (
     | Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[ConvertDetector, tyro.conf.subcommand("convert-detector")]
 )
 
 

@@ -9,6 +9,8 @@ from typing import Annotated, Union
 import tyro
 from rich.console import Console
 
+from kronc_ns.capture.detection.choice import DetectorOptions, find_keypoints
+from kronc_ns.capture.detection.detector import Detector
 from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, find_frames, prepare_frames
 from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics
 from kronc_ns.capture.masks import find_masks, write_masks
@@ -21,15 +23,15 @@ from kronc_ns.files import write_json
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.io import FORMATS, Detections, read_keypoints, write_keypoints
 from kronc_ns.pipeline import fingerprint, solve_scene
-from kronc_ns.scene import load_scene, match_keypoints
+from kronc_ns.scene import Scene, load_scene, match_keypoints
+from kronc_ns.starts import MIN_POINTS
 
 
 @dataclass
 class KroncToNerfstudio:
     """Process a walk around a car: camera poses from its semantic keypoints.
 
-    A detector such as OpenPifPaf makes the keypoints; it is no part of this program.
-    Run without them to get the frames and be told how to go on.
+    The keypoints come from a file or from a --detector. Run without either to get the frames and be told how to go on.
     """
 
     data: Path
@@ -38,6 +40,8 @@ class KroncToNerfstudio:
     """New or empty folder, or one that this command wrote; gets nerfstudio's layout and kronc.json."""
     keypoints: Path | None = None
     """Our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON. Default: those in DATA."""
+    detection: Annotated[DetectorOptions, tyro.conf.arg(name="")] = field(default_factory=DetectorOptions)
+    """How keypoints are found, where no file holds them."""
     masks: Path | None = None
     """Folder with a mask for each image, of the same stem: above 127 the car, else ignored."""
     fps: float = 5.0
@@ -64,9 +68,10 @@ class KroncToNerfstudio:
         """Process; raises `KroncError` for what the user can mend. Returns 3 for a doubtful solution, else 0."""
         config = self.solve.solver_config()
         self._check_options()
+        detector = self.detection.make()
         source = find_source(self.data)
         size = check_source(source)
-        found = self._read_keypoints(source)
+        found = None if detector else self._read_keypoints(source)
         early = None if size is None else self._intrinsics(source, size)
         out = self.output_dir
         settings = (self.fps, self.num_frames_target, self.num_downscales)
@@ -90,6 +95,8 @@ class KroncToNerfstudio:
         )
         write_json(out / "transforms.json", transforms)
         copy_reference(source, frames, out)
+        if detector is not None:
+            found = _detect(detector, frames, masks, out)
         if found is None:
             raise KroncError(_how_to_go_on(frames, out))
         note = _write_keypoints(found, frames, intrinsics.camera, masks, out)
@@ -105,6 +112,7 @@ class KroncToNerfstudio:
         levels = "".join(f", 1/{factor}" for factor in frames.factors)
         origin = "as an earlier run left them" if frames.reused else f"from {source.kind} {self.data}"
         table.add_row("frames", f"{len(frames.names)} of {frames.size[0]}x{frames.size[1]}{levels}, {origin}")
+        table.add_row("keypoints", _seen(scene))
         refined = f", refined to {solution.camera.fx:.1f} px" if config.refine_focal else ""
         table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}{refined}")
         Console().print(table)
@@ -123,6 +131,8 @@ class KroncToNerfstudio:
         data, out = self.data.resolve(), self.output_dir.resolve()
         if data == out or out in data.parents:
             raise KroncError(f"--data {self.data} lies in --output-dir {self.output_dir}: choose another output folder")
+        if self.keypoints is not None and self.detection.detector is not None:
+            raise KroncError(f"--keypoints {self.keypoints} and --detector {self.detection.detector}: give one of them")
         if self.masks is not None and not self.masks.is_dir():
             raise KroncError(f"--masks {self.masks} is no folder: expected one mask image per photo, of the same stem")
 
@@ -133,11 +143,12 @@ class KroncToNerfstudio:
             return read_keypoints(path)
         if source.kind == "scene folder":
             raise KroncError(
-                f"{self.data} has no keypoints.json: give --keypoints ({FORMATS}), which a detector such as "
-                "OpenPifPaf makes; it is no part of this package"
+                f"{self.data} has no keypoints.json: give --keypoints ({FORMATS}), or find them with --detector"
             )
         if (self.output_dir / "kronc.json").exists():
-            raise KroncError(f"{self.output_dir} is solved already: give --keypoints to solve it anew ({FORMATS})")
+            raise KroncError(
+                f"{self.output_dir} is solved already: give --keypoints ({FORMATS}) or --detector to solve it anew"
+            )
         return None
 
     def _intrinsics(self, source: Source, size: tuple[int, int]) -> Intrinsics:
@@ -157,6 +168,20 @@ def extend_commands(script: ModuleType) -> None:
 def main() -> None:
     """Entry point of `kronc-process-data`."""
     tyro.cli(KroncToNerfstudio, prog="kronc-process-data").main()
+
+
+def _detect(detector: Detector, frames: Frames, masks: tuple[str, ...] | None, out: Path) -> Detections:
+    with progress_bar("detecting") as progress:
+        return find_keypoints(detector, out, frames.names, frames.size, masks, progress)
+
+
+def _seen(scene: Scene) -> str:
+    """How many frames have enough points for a pose, and how many points they have."""
+    counts = scene.visibility.sum(1)
+    enough = int((counts >= MIN_POINTS).sum())
+    without = int((counts == 0).sum())
+    missing = f"; none in {without}" if without else ""
+    return f"{enough} of {len(counts)} frames with {MIN_POINTS} or more, {counts.mean():.1f} a frame{missing}"
 
 
 def _write_keypoints(
@@ -190,10 +215,8 @@ def _assumption(intrinsics: Intrinsics) -> str:
 def _how_to_go_on(frames: Frames, out: Path) -> str:
     images = out / "images"
     return (
-        f"{len(frames.names)} frames are ready in {images}, but there are no keypoints ({FORMATS}): detect them, e.g. "
-        "`python -m openpifpaf.predict --checkpoint shufflenetv2k16-apollo-66 --json-output "
-        f"--glob '{images}/frame_*[0-9]{Path(frames.names[0]).suffix}'`, "
-        f"then run the same command again with `--keypoints {images}`"
+        f"{len(frames.names)} frames are ready in {images}, but there are no keypoints: run the same command again "
+        f"with `--detector openpifpaf`, which finds them, or with `--keypoints` ({FORMATS})"
     )
 
 

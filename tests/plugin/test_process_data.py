@@ -1,8 +1,10 @@
 """`kronc-process-data`: from photos, scene folders and videos to a dataset nerfstudio trains on, or one clear line."""
 
+import hashlib
 import json
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.config import SolverOptions
 from kronc_ns.evaluate import evaluate_poses
 from kronc_ns.export import MARKER
@@ -170,7 +173,8 @@ def test_photos_without_keypoints_say_how_to_go_on(
     err = capsys.readouterr().err.strip()
     assert len(err.splitlines()) == 1
     assert err.startswith("error: 12 frames are ready in")
-    assert f"--keypoints {out / 'images'}" in err
+    assert "`--detector openpifpaf`" in err
+    assert "`--keypoints`" in err
     assert (out / MARKER).exists()
     content = json.loads((out / "transforms.json").read_text())
     assert content["fl_x"] == 400.0
@@ -291,10 +295,106 @@ def test_a_scene_folder_needs_keypoints(scene: Path, tmp_path: Path, capsys: pyt
     assert not (tmp_path / "out").exists()
 
 
+FAKE_OPENPIFPAF = """#!{python}
+import hashlib, json, sys
+from pathlib import Path
+answers = json.loads(Path({answers!r}).read_text())
+images = [a for a in sys.argv if a.endswith(".jpg")]
+Path({calls!r}).open("a").write(str(len(images)) + "\\n")
+for image in images:
+    answer = answers[hashlib.sha256(Path(image).read_bytes()).hexdigest()]
+    Path("found", image + ".predictions.json").write_text(json.dumps(answer))
+"""
+
+
+def _fake_openpifpaf(folder: Path, capture: Capture, images: list[Path]) -> Path:
+    """A program that takes OpenPifPaf's arguments and finds the capture's car, and a small second one."""
+    ours = torch.where(capture.keypoints[..., 2:] > 0, capture.keypoints - torch.tensor([0.5, 0.5, 0.0]), 0.0)
+    other = torch.where(ours[..., 2:] > 0, ours * torch.tensor([0.1, 0.1, 1.0]), 0.0)
+    answers = {
+        hashlib.sha256(image.read_bytes()).hexdigest(): [
+            {"keypoints": car[i].flatten().tolist()} for car in (other, ours)
+        ]
+        for i, image in enumerate(images)
+    }
+    (folder / "answers.json").write_text(json.dumps(answers))
+    program = folder / "openpifpaf"
+    places = {"answers": str(folder / "answers.json"), "calls": str(folder / "calls")}
+    program.write_text(FAKE_OPENPIFPAF.format(python=sys.executable, **places))
+    program.chmod(0o755)
+    return program
+
+
+def test_a_detector_finds_the_keypoints(
+    scene: Path,
+    tmp_path: Path,
+    config: SolverOptions,
+    capture: Capture,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setenv("KRONC_NS_CACHE", str(tmp_path / "cache"))
+    photos = [scene / f"images/IMG_{i}.jpg" for i in range(1, VIEWS + 1)]
+    program, out = _fake_openpifpaf(tmp_path, capture, photos), tmp_path / "out"
+    command = KroncToNerfstudio(
+        data=scene / "images",
+        output_dir=out,
+        masks=scene / "masks",
+        detection=DetectorOptions("openpifpaf", detector_python=program),
+        focal_length_px=400.0,
+        solve=config,
+    )
+    assert _status(command) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "12 of 12 frames with 4 or more" in printed
+    assert "12 images show several cars" in printed
+    assert (load_scene(out).keypoints - capture.keypoints).abs().max() < 2e-3
+    assert _status(command) == 0
+    assert (tmp_path / "calls").read_text() == f"{VIEWS}\n"  # the second run had nothing left to detect
+
+
+@pytest.mark.parametrize(
+    ("detection", "message"),
+    [
+        (DetectorOptions("yolo-pose"), "--detector yolo-pose needs --detector-weights"),
+        (DetectorOptions("onnx", Path("nowhere.onnx")), "nowhere.onnx does not exist"),
+        (DetectorOptions("openpifpaf", detector_python=Path("nowhere")), "--detector-python nowhere is no program"),
+        (DetectorOptions(detector_weights=Path("nowhere.onnx")), "--detector-weights and --detector-python say"),
+    ],
+)
+def test_detectors_that_cannot_run_are_named_before_anything_is_written(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], detection: DetectorOptions, message: str
+):
+    out = tmp_path / "out"
+    assert _status(KroncToNerfstudio(data=scene, output_dir=out, detection=detection)) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_keypoints_and_a_detector_are_one_too_many(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    detection = DetectorOptions("openpifpaf")
+    command = KroncToNerfstudio(
+        data=scene, output_dir=tmp_path / "out", keypoints=scene / "keypoints.json", detection=detection
+    )
+    assert _status(command) == 2
+    assert "--detector openpifpaf: give one of them" in capsys.readouterr().err
+
+
 def test_help_names_every_option(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("sys.argv", ["kronc-process-data", "--help"])
     with pytest.raises(SystemExit):
         process_data.main()
     text = capsys.readouterr().out
-    for option in ("data", "output-dir", "keypoints", "masks", "fps", "num-frames-target", "focal-length-px", "config"):
+    for option in (
+        "data",
+        "output-dir",
+        "keypoints",
+        "masks",
+        "fps",
+        "num-frames-target",
+        "focal-length-px",
+        "config",
+        "detector",
+        "detector-weights",
+    ):
         assert f"--{option} " in text
