@@ -1,0 +1,113 @@
+"""The pipeline of all our methods: training that cannot recover ends, and refined poses are evaluated fairly."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from nerfstudio.models.base_model import Model
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from kronc_ns.console import exit_on_error
+from kronc_ns.errors import KroncError
+
+_STEPS, _RATE, _RATE_FINAL = 60, 2e-3, 1e-4  # of a test pose: radians, and units of the scene
+_RAYS = 1024
+
+
+@dataclass
+class KroncPipelineConfig(VanillaPipelineConfig):
+    """nerfstudio's pipeline for any method."""
+
+    _target: type = field(default_factory=lambda: KroncPipeline)
+
+
+class KroncPipeline(VanillaPipeline):
+    """nerfstudio's pipeline, which stops at a loss that is not finite and refines test poses where it has to."""
+
+    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
+        """Outputs, losses and metrics of a batch; ends the process with status 2 where a loss is not finite."""
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        with exit_on_error():
+            check_finite(losses, step)
+        return outputs, losses, metrics
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint; for evaluation, let the test poses follow where training poses were refined.
+
+        Training poses settle where the model wants them. Test poses had no part in that, so their images would be
+        compared with renderings from elsewhere. As usual for such methods (NeRF--, BARF), each is found by its own
+        image with the model frozen before it is compared.
+        """
+        super().load_pipeline(loaded_state, step)
+        camera_optimizer = getattr(self.model.config, "camera_optimizer", None)
+        if self.test_mode == "test" and camera_optimizer is not None and camera_optimizer.mode != "off":
+            self.refine_test_poses()
+
+    def refine_test_poses(self) -> None:
+        """Move every test camera to where the model, which stays as it is, explains its image best."""
+        manager: Any = self.datamanager  # either of nerfstudio's two; their common ancestor declares less
+        dataset = manager.eval_dataset
+        CONSOLE.print(f"poses were refined in training: refining the {len(dataset)} test poses by their images")
+        self.eval()
+        whole = isinstance(manager, FullImageDatamanager)
+        for i, (camera, batch) in enumerate(manager.fixed_indices_eval_dataloader):
+            generator = torch.Generator().manual_seed(i)
+            dataset.cameras.camera_to_worlds[i] = refined_pose(self.model, camera, batch, whole, generator)
+        manager.setup_eval()  # what it prepared for evaluation may hold copies of the cameras
+
+
+def check_finite(losses: Mapping[str, Tensor], step: int) -> None:
+    """Raise `KroncError` where a loss is NaN or infinite."""
+    wrong = [name for name, loss in losses.items() if not bool(loss.isfinite().all())]
+    if wrong:
+        value = float(losses[wrong[0]].detach().sum())
+        raise KroncError(
+            f"{wrong[0]} is {value} at step {step}, from which training cannot recover: expected a finite loss; go "
+            "back to the method's defaults, or lower its learning rates"
+        )
+
+
+@torch.enable_grad()
+def refined_pose(
+    model: Model, camera: Cameras, batch: Mapping[str, Tensor], whole: bool, generator: torch.Generator
+) -> Float[Tensor, "3 4"]:
+    """c2w (OpenGL axes) near that of ``camera [1]`` from which ``model`` explains the image in ``batch`` best.
+
+    nerfstudio's own camera optimiser and the model's own loss, on random pixels or (``whole``, for models that render
+    whole images only) on the image; where there is a mask, on its pixels.
+    """
+    adjustment = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=str(camera.device))
+    optimizer = torch.optim.Adam(adjustment.parameters(), lr=_RATE)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (_RATE_FINAL / _RATE) ** (1 / _STEPS))
+    moved = copy.copy(camera)
+    moved.metadata = {"cam_idx": 0}  # the optimiser's only one
+    original = moved.camera_to_worlds
+    usable = batch["mask"][..., 0] if "mask" in batch else torch.ones(batch["image"].shape[:2])
+    pixels = usable.nonzero()
+    if not len(pixels):
+        return original[0]
+    for _ in range(_STEPS):
+        moved.camera_to_worlds = original
+        moved.camera_to_worlds = adjustment.apply_to_camera(moved)
+        if whole:
+            outputs, target = model(moved), dict(batch)
+        else:
+            rows, columns = pixels[torch.randint(len(pixels), (_RAYS,), generator=generator)].unbind(-1)
+            coords = torch.stack([rows, columns], dim=-1) + 0.5
+            outputs = model(moved.generate_rays(camera_indices=0, coords=coords.to(camera.device)))
+            target = {"image": batch["image"][rows, columns]}
+        loss = torch.stack(list(model.get_loss_dict(outputs, target).values())).sum()
+        (gradient,) = torch.autograd.grad(loss, [adjustment.pose_adjustment])
+        adjustment.pose_adjustment.grad = gradient
+        optimizer.step()
+        schedule.step()
+    moved.camera_to_worlds = original
+    return adjustment.apply_to_camera(moved)[0].detach()
