@@ -30,9 +30,10 @@ def decode_cif(
     ``min_vote``. A field without votes gets confidence 0 and the place (0, 0).
     """
     count, _, height, width = fields.shape
-    flat = fields.reshape(count, 5, height * width).astype(np.float64)
+    flat = fields.reshape(count, 5, height * width)
     chosen = np.argpartition(-flat[:, 0], min(_MAX_VOTES, height * width) - 1, axis=1)[:, :_MAX_VOTES]
-    confidence, x, y, spread, size = np.moveaxis(np.take_along_axis(flat, chosen[:, None], axis=2), 1, 0)
+    votes = np.take_along_axis(flat, chosen[:, None], axis=2).astype(np.float64)
+    confidence, x, y, spread, size = np.moveaxis(votes, 1, 0)
     places = np.stack([x, y], axis=-1)
     confidence = np.where(confidence >= min_vote, confidence, 0.0)
     if allowed is not None:

@@ -90,6 +90,7 @@ def open_model(path: Path) -> OnnxModel:
         raise KroncError(f"{card} is no JSON object: expected what `kronc convert-detector` writes beside an ONNX file")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # its warnings about graphs help no user
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave idle cores to others
     wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
     providers = [name for name in wanted if name in onnxruntime.get_available_providers()]
     try:
