@@ -3,7 +3,11 @@
 import json
 import math
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,11 +15,14 @@ import torch
 
 from kronc_ns import cli
 from kronc_ns.benchmark.baselines import bundle_adjustment, triangulate
+from kronc_ns.benchmark.commands import Commands
 from kronc_ns.benchmark.likelihood import maximum_likelihood
+from kronc_ns.benchmark.nvs_measures import Trainings, judge_exact, judge_solved
+from kronc_ns.benchmark.nvs_rows import METHODS, nvs_tasks
 from kronc_ns.benchmark.pose_rows import PAPER_NOISE, PAPER_VIEWS, pose_tasks
 from kronc_ns.benchmark.poses import capture_scene
 from kronc_ns.benchmark.problems import REPORT_SEEDS, Options, best_poses, load_shapes, solution_figures
-from kronc_ns.benchmark.rows import Runs, Task, measure_row
+from kronc_ns.benchmark.rows import Runs, Task, measure_row, measure_rows
 from kronc_ns.benchmark.speed_rows import speed_tasks
 from kronc_ns.benchmark.table import rows_table
 from kronc_ns.errors import KroncError
@@ -153,6 +160,92 @@ def test_report_seeds_meet_held_out_shapes_only(tmp_path):
         load_shapes(file)
 
 
+def test_rows_come_in_their_order_however_many_are_measured_at_once():
+    together = threading.Barrier(2, timeout=10)
+
+    def measure(seed: int, name: str) -> dict[str, float]:
+        together.wait()  # broken where a row waits for the other to end
+        time.sleep(0.2 if name == "first" else 0.0)
+        return {"value": seed}
+
+    def judge(runs: Runs) -> tuple[dict[str, float], None]:
+        return {"lost": runs.lost}, None
+
+    tasks = [Task(name, "", "", 1, partial(measure, name=name), judge) for name in ("first", "second")]
+    rows = list(measure_rows(tasks, first_seed=5, workers=2))
+    assert [(row.name, row.seeds, row.reached) for row in rows] == [
+        ("first", (5,), {"lost": 0}),
+        ("second", (5,), {"lost": 0}),
+    ]
+
+
+def test_commands_give_what_they_print_and_the_end_of_their_errors():
+    with Commands({"GREETING": "hello"}) as commands:
+        assert commands.run("python", "-c", "import os; print(os.environ['GREETING'])") == "hello\n"
+        with pytest.raises(KroncError, match="python ended with status 3: last words"):
+            commands.run("python", "-c", "import sys; print('last words', file=sys.stderr); sys.exit(3)")
+
+
+def test_commands_end_with_their_context():
+    with ThreadPoolExecutor(1) as pool:
+        begin = time.perf_counter()
+        with Commands() as commands:
+            waiting = pool.submit(commands.run, "python", "-c", "import time; time.sleep(60)")
+            time.sleep(0.5)
+        with pytest.raises(KroncError, match="python ended with status"):
+            waiting.result()
+        assert time.perf_counter() - begin < 30
+        with pytest.raises(KroncError, match="was not started"):
+            commands.run("python", "-c", "")
+
+
+def test_every_method_is_trained_on_every_kind_of_poses(tmp_path):
+    tasks = nvs_tasks(Trainings(tmp_path, Commands()))
+    for method in METHODS:
+        asked = [task.asked for task in tasks if task.name.startswith(method)]
+        assert asked == [">= 28 dB", "within 0.3 dB of exact poses", "within 1 dB of exact poses", ""]
+    assert len({task.name for task in tasks}) == len(tasks) == 12
+
+
+class Pretended(Commands):
+    """Notes what would be run; all fields show their test views alike."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ran: list[tuple[str, ...]] = []
+
+    def run(self, command: str, *arguments: str) -> str:
+        self.ran.append((command, *arguments))
+        metrics = {"psnr": 30.0, "ssim": 0.9, "lpips": None}
+        return "" if command == "ns-train" else json.dumps({"full": metrics, "masked": {**metrics, "psnr": 27.0}})
+
+
+def test_rows_of_a_method_share_its_trainings_and_differ_in_their_poses(tmp_path):
+    commands = Pretended()
+    tasks = nvs_tasks(Trainings(tmp_path, commands, views=10, width=64))[:4]
+    exact, solved, noisy, unsolved = (row.reached for row in measure_rows(tasks, first_seed=3, workers=2))
+    trained = [arguments for arguments in commands.ran if arguments[0] == "ns-train"]
+    assert len(trained) == len({arguments[3] for arguments in trained}) == 4
+    assert exact["rotation_deg"] < 1e-6 < solved["rotation_deg"] < 0.05 < noisy["rotation_deg"] < 1.5
+    assert 3 < unsolved["rotation_deg"] < 12
+    assert (exact["psnr"], exact["vehicle_psnr"], solved["psnr_below_exact"]) == (30.0, 27.0, 0.0)
+    assert "psnr_below_exact" not in exact
+    assert "lpips" not in exact
+    assert exact["centre_cm"] < 1e-3 < noisy["centre_cm"] < 15 < unsolved["centre_cm"]
+
+
+@pytest.mark.parametrize(("loss", "reached"), [(0.29, True), (0.31, False)])
+def test_a_loss_is_judged_by_its_mean_over_the_seeds(loss, reached):
+    runs = [{"psnr": 30.0, "psnr_below_exact": loss - 0.2}, {"psnr": 20.0, "psnr_below_exact": loss + 0.2}]
+    figures, passed = judge_solved(Runs(runs), limit_db=0.3)
+    assert passed is reached
+    assert figures == pytest.approx({"psnr": 25.0, "psnr_below_exact": loss, "lost": 0})
+    assert judge_solved(Runs([*runs, {"failed": 1.0}]), limit_db=0.3)[1] is False
+    assert judge_exact(Runs(runs), least_db=25.0)[1] is True
+    assert judge_exact(Runs(runs), least_db=25.1)[1] is False
+    assert judge_exact(Runs([{"failed": 1.0}]), least_db=25.0) == ({"lost": 1}, False)
+
+
 @pytest.fixture
 def bench(monkeypatch, capsys):
     """Run `kronc bench ARGUMENTS` in this process: (status, stdout, stderr)."""
@@ -195,6 +288,8 @@ def test_bench_refuses_what_it_cannot_measure(bench):
         (("--rows", "nothing"), "clockwise lap"),
         (("--seeds", "0"), "--seeds is 0"),
         (("--shapes", "missing.json"), "missing.json"),
+        (("--suite", "nvs", "--rows", "nothing"), "kronc-dvgo-cpu, exact poses"),
+        (("--suite", "nvs", "--keep", "."), "--keep . exists already"),
     ):
         status, _, err = bench(*arguments)
         assert status == 2

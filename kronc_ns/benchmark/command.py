@@ -1,10 +1,13 @@
 """`kronc bench`: measure the tables on this machine."""
 
 import json
+import os
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from typing_extensions import assert_never
@@ -12,13 +15,19 @@ from typing_extensions import assert_never
 from kronc_ns.console import progress_bar
 from kronc_ns.errors import KroncError
 
+if TYPE_CHECKING:
+    from kronc_ns.benchmark.nvs_measures import Trainings
+
+_MOST_TRAININGS = 4  # at a time, of one thread and about 1.5 GB each
+
 
 @dataclass(kw_only=True)
 class Bench:
-    """Measure accuracy (poses) or time and memory (speed) on synthetic captures, beside what is asked of each row."""
+    """Measure accuracy, speed or view synthesis on synthetic captures, beside what is asked of each row."""
 
-    suite: Literal["poses", "speed"] = "poses"
-    """poses: errors beside those of the best that the data allow; speed: time and memory beside other solvers'."""
+    suite: Literal["poses", "speed", "nvs"] = "poses"
+    """poses: errors beside those of the best that the data allow; speed: time and memory beside other solvers'; nvs:
+    radiance fields trained on exact, solved and unsolved poses (CPU, half an hour on two cores)."""
     seeds: int | None = None
     """Number of seeds of every row (default: what the row asks for)."""
     first_seed: int = 0
@@ -32,6 +41,8 @@ class Bench:
     """On so many seeds 10,000 steps of Adam run beside (default: none in poses, 1 in speed); half a minute each."""
     scenes: int = 200
     """Scenes of the throughput row."""
+    keep: Path | None = None
+    """Of nvs: new folder for the captures, trained runs and pictures of the test views (default: they are deleted)."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -45,27 +56,37 @@ class Bench:
         self._check()
         shapes = Shapes() if self.shapes is None else load_shapes(self.shapes)
         options = Options(shapes, self.first_seed, self.adam_seeds or 0, self.scenes)
-        match self.suite:
-            case "poses":
-                from kronc_ns.benchmark.pose_rows import pose_tasks
+        workers = 1
+        with ExitStack() as stack:
+            match self.suite:
+                case "poses":
+                    from kronc_ns.benchmark.pose_rows import pose_tasks
 
-                tasks = pose_tasks(options)
-            case "speed":
-                from kronc_ns.benchmark.speed_rows import speed_tasks
+                    tasks = pose_tasks(options)
+                case "speed":
+                    from kronc_ns.benchmark.speed_rows import speed_tasks
 
-                tasks = speed_tasks(options)
-            case _:
-                assert_never(self.suite)
-        chosen = [task for task in tasks if self.rows.lower() in task.name.lower()]
-        if not chosen:
-            raise KroncError(f"--rows {self.rows!r}: expected part of one of {'; '.join(task.name for task in tasks)}")
-        machine = hardware()
-        measured = []
-        with progress_bar(self.suite) as progress:
-            for row in measure_rows(chosen, self.first_seed, self.seeds, lambda _, i, n: progress(i, n, None)):
-                measured.append(row)
-                verdict = {True: "reached", False: "missed", None: "measured"}[row.passed]
-                print(f"{verdict}: {row.name} ({row.seconds:.1f} s)", file=sys.stderr)
+                    tasks = speed_tasks(options)
+                case "nvs":
+                    from kronc_ns.benchmark.nvs_rows import nvs_tasks
+
+                    tasks = nvs_tasks(self._trainings(stack))
+                    workers = min(len(os.sched_getaffinity(0)), _MOST_TRAININGS)
+                case _:
+                    assert_never(self.suite)
+            chosen = [task for task in tasks if self.rows.lower() in task.name.lower()]
+            if not chosen:
+                names = "; ".join(task.name for task in tasks)
+                raise KroncError(f"--rows {self.rows!r}: expected part of one of {names}")
+            machine = hardware()
+            measured = []
+            with progress_bar(self.suite) as progress:
+                rows = measure_rows(chosen, self.first_seed, self.seeds, lambda _, i, n: progress(i, n, None), workers)
+                for row in rows:
+                    measured.append(row)
+                    verdict = {True: "reached", False: "missed", None: "measured"}[row.passed]
+                    figures = ", ".join(f"{name} {value:.4g}" for name, value in row.reached.items())
+                    print(f"{verdict}: {row.name} ({row.seconds:.1f} s): {figures}", file=sys.stderr)
         if self.json:
             content = {"suite": self.suite, "hardware": machine, "rows": [row.as_dict() for row in measured]}
             print(json.dumps(content, allow_nan=False))
@@ -75,6 +96,20 @@ class Bench:
         Console().print(rows_table(measured, title))
         print(", ".join(f"{name} {value}" for name, value in machine.items()))
         return 0
+
+    def _trainings(self, stack: ExitStack) -> "Trainings":
+        """What the rows of nvs are made of; ``stack`` ends its commands and deletes what is not to be kept."""
+        from kronc_ns.benchmark.commands import Commands
+        from kronc_ns.benchmark.nvs_measures import Trainings
+
+        folder = self.keep
+        if folder is None:
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="kronc_nvs_", ignore_cleanup_errors=True)))
+        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise KroncError(f"--keep {folder} exists already: expected a new or empty folder")
+        # a training is faster on one core beside another than on two after it
+        environment = {"OMP_NUM_THREADS": "1", "KRONC_NS_CACHE": str(folder.resolve() / "cache")}
+        return Trainings(folder.resolve(), stack.enter_context(Commands(environment)))
 
     def _check(self) -> None:
         least = {"--seeds": (self.seeds, 1), "--first-seed": (self.first_seed, 0), "--scenes": (self.scenes, 2)}

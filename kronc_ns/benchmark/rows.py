@@ -5,7 +5,9 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -120,12 +122,26 @@ def measure_rows(
     first_seed: int = 0,
     seeds: int | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    workers: int = 1,
 ) -> Iterator[Row]:
-    """Measure rows one after the other on report seeds ``first_seed``, ...; ``seeds`` overrides their number."""
-    for task in tasks:
+    """Measure rows on report seeds ``first_seed``, ...; ``seeds`` overrides their number.
+
+    They come in their order, one after the other; with several ``workers`` as many are measured at the same time.
+    """
+
+    def measure(task: Task) -> Row:
         count = task.seeds if seeds is None else seeds
-        report = None if progress is None else (lambda i, n, name=task.name: progress(name, i, n))
-        yield measure_row(task, range(first_seed, first_seed + count), report)
+        report = None if progress is None else partial(progress, task.name)
+        return measure_row(task, range(first_seed, first_seed + count), report)
+
+    if workers == 1:  # in the thread that is the program's: others have other numbers of threads to compute with
+        yield from map(measure, tasks)
+        return
+    pool = ThreadPoolExecutor(workers)
+    try:
+        yield from pool.map(measure, tasks)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def hardware() -> dict[str, Any]:

@@ -1,8 +1,6 @@
 """Are the poses good enough to train on? The same training on solved, exact and unoptimised poses."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -13,9 +11,9 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from kronc_ns.benchmark.commands import Commands
 from kronc_ns.capture.images import load_image, write_downscales
 from kronc_ns.capture.masks import downscale_mask
-from kronc_ns.errors import KroncError
 from kronc_ns.export import claim_output, write_solution
 from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.init import circular_poses
@@ -23,16 +21,25 @@ from kronc_ns.pipeline import KroncConfig, solve_scene
 from kronc_ns.scene import Scene, load_scene, read_poses
 from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
 
-Poses = Literal["exact", "solved", "circle"]
+Poses = Literal["exact", "solved", "given", "circle"]
 
 
-def write_variant(folder: Path, data: Path, which: Poses, config: KroncConfig, points: Float[Tensor, "j 3"]) -> None:
+def write_variant(
+    folder: Path,
+    data: Path,
+    which: Poses,
+    config: KroncConfig,
+    points: Float[Tensor, "j 3"],
+    keypoints: Path | None = None,
+) -> None:
     """A data set of the rendered capture ``data`` with one kind of poses, ready for `kronc-dataparser`.
 
-    ``points`` are the true keypoints in the world of reference.json. The unoptimised circle is brought as near to
-    the truth as a similarity can, so that the car lies in its scene box.
+    ``points`` are the true keypoints in the world of reference.json. ``keypoints`` is a file to solve from instead of
+    the capture's. Unoptimised poses are those of transforms.json, or the circle, brought as near to the truth as a
+    similarity can, so that the car lies in its scene box.
     """
-    scene = load_scene(data)
+    found = keypoints or data / "keypoints.json"
+    scene = load_scene(data, found)
     reference = read_poses(data / "reference.json")
     truth = torch.stack([reference[name] for name in scene.names])
     claim_output(folder)
@@ -40,12 +47,15 @@ def write_variant(folder: Path, data: Path, which: Poses, config: KroncConfig, p
         solution = solve_scene(scene, config)
     else:
         c2w = truth
-        if which == "circle":
+        if which == "given":
+            assert scene.given_c2w is not None
+            c2w = scene.given_c2w
+        elif which == "circle":
             circle = circular_poses(len(scene), config.radius_m, config.direction, config.laps)
             c2w = umeyama(circle[..., 3], truth[..., 3]).apply_to_poses(circle)
         solution = _as_solution(scene.names, scene, c2w, points)
     write_solution(folder, scene, solution, data, inputs=which)
-    (folder / "keypoints.json").write_bytes((data / "keypoints.json").read_bytes())
+    (folder / "keypoints.json").write_bytes(found.read_bytes())
 
 
 def add_half_size(data: Path) -> None:
@@ -58,10 +68,17 @@ def add_half_size(data: Path) -> None:
         Image.fromarray(half).save(data / "masks_2" / mask.name)
 
 
-def train(data: Path, method: str, out: Path, options: Sequence[str] = (), parser: Sequence[str] = ()) -> Path:
+def train(
+    data: Path,
+    method: str,
+    out: Path,
+    options: Sequence[str] = (),
+    parser: Sequence[str] = (),
+    commands: Commands | None = None,
+) -> Path:
     """`ns-train METHOD OPTIONS kronc-dataparser PARSER` on a solved data set; the path of the run's config.yml."""
     arguments = ["--data", str(data), "--output-dir", str(out), "--experiment-name", data.name, "--timestamp", "run"]
-    run("ns-train", method, *arguments, *options, "kronc-dataparser", *parser)
+    (commands or Commands()).run("ns-train", method, *arguments, *options, "kronc-dataparser", *parser)
     return out / data.name / method / "run" / "config.yml"
 
 
@@ -75,12 +92,7 @@ def evaluate(config: Path, renders: Path | None = None) -> dict[str, Any]:
 
 def run(command: str, *arguments: str) -> str:
     """Run one of nerfstudio's commands of this environment; its output, or an error that ends with it."""
-    path = Path(sys.executable).parent / command
-    done = subprocess.run([str(path), *arguments], capture_output=True, text=True, check=False)
-    if done.returncode:
-        last = "\n".join((done.stdout + done.stderr).strip().splitlines()[-15:])
-        raise KroncError(f"{command} ended with status {done.returncode}: {last}")
-    return done.stdout + done.stderr
+    return Commands().run(command, *arguments)
 
 
 def _as_solution(names: tuple[str, ...], scene: Scene, c2w: Tensor, points: Tensor) -> Solution:
