@@ -32,7 +32,7 @@ from kronc_ns.solve.lm_cpu import (
     TRIM_SIGMAS,
     TRIMMED,
 )
-from kronc_ns.solve.problem import Batched, Problem, Residuals, ShapePrior, State
+from kronc_ns.solve.problem import Batched, Problem, Residuals, ShapePrior, State, array
 from kronc_ns.solve.threads import aside
 
 _HUBER_SIGMAS = 2.0
@@ -109,24 +109,21 @@ def _adjust_compiled(
 ) -> LmResult:
     scenes = len(problem.uv)
     state = start.each(lambda x: x.clone(memory_format=torch.contiguous_format))
-    sigma, cost, shape_weight = problem.uv.new_empty(3, scenes)
-    steps, converged = torch.zeros(scenes, dtype=torch.long), torch.zeros(scenes, dtype=torch.bool)
     inlier = torch.zeros(problem.weight.shape, dtype=torch.bool)
     losses = problem.uv.new_empty(config.iterations)
     shape = problem.shape or ShapePrior.nothing(problem.uv)
-    given = (problem.uv, problem.weight, problem.focal, _redundancy(problem))
-    most = sigma.new_full((scenes,), math.inf) if most_sigma_px is None else most_sigma_px
-    arguments = (
-        *(x.numpy() for x in (state.rotation, state.translation, state.points)),
-        *(x.contiguous().numpy() for x in (*given, most, shape.mean, shape.precision)),
-        shape.freedom,
-        problem.points_known,
-        config.iterations,
-        config.tolerance,
-        *(x.numpy() for x in (sigma, cost, shape_weight, steps, converged, inlier, losses)),
-    )
+    most = problem.uv.new_full((scenes,), math.inf) if most_sigma_px is None else most_sigma_px
     with aside():
-        lm_cpu.adjust_scenes(*arguments)
+        found = lm_cpu.adjust_scenes(
+            *(state.rotation.numpy(), state.translation.numpy(), state.points.numpy()),
+            *(array(problem.uv), array(problem.weight), array(problem.focal)),
+            *(array(_redundancy(problem)), array(most), array(shape.mean), array(shape.precision), shape.freedom),
+            *(problem.points_known, config.iterations, config.tolerance),
+            *(inlier.numpy(), losses.numpy()),
+        )
+    found = torch.from_numpy(found)
+    sigma, cost, shape_weight = found[:3]
+    steps, converged = found[3].long(), found[4].bool()
     detections = max(1, int((problem.weight[:1] > 0).sum()))
     loss = (losses[: int(steps[0]) if scenes else 0] / detections).sqrt().tolist()
     history = {"step": [float(step) for step in range(1, len(loss) + 1)], "loss": loss}

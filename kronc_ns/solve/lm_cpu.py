@@ -11,8 +11,11 @@ only.
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kronc_ns.compiled import compiled
+
+Array = NDArray[Any]
 
 BEHIND_PX = 1e4
 """Residual of a point behind its camera: an outlier to every robust loss."""
@@ -35,90 +38,90 @@ START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e9
 ROBUST, TRIMMED = 0, 1
 
 
-@compiled
 def adjust_scenes(
-    rotation: Any,  # in and out [B, N, 3, 3]
-    translation: Any,  # in and out [B, N, 3]
-    points: Any,  # in and out [B, J, 3]
-    uv: Any,  # [B, N, 2, J]
-    weight: Any,  # [B, N, J]
-    focal: Any,  # [B, 2]
-    redundancy: Any,  # [B]
-    most_sigma: Any,  # [B]
-    mean: Any,  # [3J] of the shape prior
-    precision: Any,  # [3J, 3J] of the shape prior; [0, 0] without one
-    freedom: Any,
-    points_known: Any,
-    iterations: Any,
-    tolerance: Any,
-    sigma: Any,  # out [B]
-    cost: Any,  # out [B], in squared pixels
-    shape_weight: Any,  # out [B]
-    steps: Any,  # out [B]
-    converged: Any,  # out [B]
-    inlier: Any,  # out [B, N, J]
-    losses: Any,  # out [iterations], cost of the first scene after every step
-) -> None:
-    """`lm.adjust` of every scene."""
+    rotation: Array,  # in and out [B, N, 3, 3]
+    translation: Array,  # in and out [B, N, 3]
+    points: Array,  # in and out [B, J, 3]
+    uv: Array,  # [B, N, 2, J]
+    weight: Array,  # [B, N, J]
+    focal: Array,  # [B, 2]
+    redundancy: Array,  # [B]
+    most_sigma: Array,  # [B]
+    mean: Array,  # [3J] of the shape prior
+    precision: Array,  # [3J, 3J] of the shape prior; [0, 0] without one
+    freedom: float,
+    points_known: bool,
+    iterations: int,
+    tolerance: float,
+    inlier: Array,  # out [B, N, J]
+    losses: Array,  # out [iterations], cost of the first scene after every step
+) -> Array:
+    """`lm.adjust` of every scene: rows of sigma, cost in squared pixels, shape weight, steps, converged."""
+    found = np.empty((len(uv), 5))
     for b in range(len(uv)):
-        first, joint, measured, own = detections(uv[b], weight[b])
-        norm, sigma[b], cost[b], shape_weight[b], steps[b], converged[b] = _adjust(
-            rotation[b], translation[b], points[b], first, joint, measured, own, focal[b], redundancy[b],
-            most_sigma[b], mean, precision, freedom, points_known, iterations, tolerance,
-            losses if b == 0 else np.empty(0),
+        found[b] = _adjust(
+            rotation[b], translation[b], points[b], uv[b], weight[b], focal[b], redundancy[b], most_sigma[b], mean,
+            precision, freedom, points_known, iterations, tolerance, inlier[b], losses[: 0 if b else None],
         )  # fmt: skip
-        for n in range(len(first) - 1):
-            for k in range(first[n], first[n + 1]):
-                inlier[b, n, joint[k]] = norm[k] <= TRIM_SIGMAS * sigma[b]
+    return found.T
 
 
-@compiled
 def camera_covariances(
-    rotation: Any,  # [B, N, 3, 3]
-    translation: Any,  # [B, N, 3]
-    points: Any,  # [B, J, 3]
-    uv: Any,  # [B, N, 2, J]
-    weight: Any,  # [B, N, J], 0 for outliers
-    focal: Any,  # [B, 2]
-    damping: Any,
-    variance: Any,  # [B], of the inliers
-    strength: Any,  # [B], weight of the shape prior
-    precision: Any,  # [3J, 3J] of the shape prior; [0, 0] without one
-    trace: Any,
-    covariance: Any,  # out [B, N, 6, 6]
+    rotation: Array,  # [B, N, 3, 3]
+    translation: Array,  # [B, N, 3]
+    points: Array,  # [B, J, 3]
+    uv: Array,  # [B, N, 2, J]
+    weight: Array,  # [B, N, J], 0 for outliers
+    focal: Array,  # [B, 2]
+    damping: float,
+    variance: Array,  # [B], of the inliers
+    strength: Array,  # [B], weight of the shape prior
+    precision: Array,  # [3J, 3J] of the shape prior; [0, 0] without one
+    trace: float,
+    covariance: Array,  # out [B, N, 6, 6]
 ) -> None:
     """`uncertainty.camera_covariance` of every scene."""
     views, size = rotation.shape[1], 3 * points.shape[1]
     matrix, rhs, pull = np.empty((size, size)), np.empty(size), np.zeros(size)
-    whitener, whitened = np.empty((views, 6, 6)), np.empty((views, 6, size + 1))
+    whitener = np.empty((views, 6, 6))
     for b in range(len(uv)):
         first, joint, measured, own = detections(uv[b], weight[b])
         seen, error, norm = np.empty((len(joint), 3)), np.empty((len(joint), 2)), np.empty(len(joint))
         project(rotation[b], translation[b], points[b], first, joint, measured, own, focal[b], seen, error, norm)
-        whitened[:] = 0.0
+        whitened = np.zeros((views, 6, size + 1))
         reduce_system(
             rotation[b], first, joint, seen, error, own, focal[b], damping, strength[b], precision, pull,
             whitener, whitened, matrix, rhs,
         )  # fmt: skip
         gauge, inverse, mean = _gauge(points[b], joint, trace)
-        stiffness = 0.0
-        for i in range(size):
-            stiffness += matrix[i, i] / size
-        for i in range(size):
-            for p in range(7):
-                factor = stiffness * gauge[p, i]
-                for k in range(i + 1):
-                    matrix[i, k] += factor * gauge[p, k]
-        if not _factor(matrix):
-            covariance[b] = np.nan
-            continue
-        _forward(matrix, gauge)
-        for n in range(views):
-            z = whitened[n]
-            _forward(matrix, z)
-            _camera_covariance(
-                rotation[b, n], translation[b, n], mean, whitener[n], z, gauge, inverse, variance[b], covariance[b, n]
-            )
+        _relative_covariances(
+            rotation[b], translation[b], mean, gauge, inverse, matrix, whitener, whitened, variance[b], covariance[b]
+        )
+
+
+@compiled
+def _relative_covariances(
+    rotation: Any, translation: Any, mean: Any, gauge: Any, inverse: Any, matrix: Any, whitener: Any, whitened: Any,
+    variance: Any, covariance: Any,
+) -> None:  # fmt: skip
+    """Those of all cameras of a scene; see `uncertainty` for the equations."""
+    size = len(matrix)
+    stiffness = 0.0
+    for i in range(size):
+        stiffness += matrix[i, i] / size
+    for i in range(size):
+        for p in range(7):
+            factor = stiffness * gauge[p, i]
+            for k in range(i + 1):
+                matrix[i, k] += factor * gauge[p, k]
+    if not _factor(matrix):
+        covariance[:] = np.nan
+        return
+    _forward(matrix, gauge)
+    for n in range(len(rotation)):
+        z = whitened[n]
+        _forward(matrix, z)
+        _camera_covariance(rotation[n], translation[n], mean, whitener[n], z, gauge, inverse, variance, covariance[n])
 
 
 @compiled
@@ -129,11 +132,13 @@ def _gauge(points: Any, joint: Any, trace: Any) -> Any:
     """
     joints = len(points)
     moves, square, inverse, mean = np.zeros((8, 3 * joints)), np.empty((7, 7)), np.empty((7, 7)), np.zeros(3)
-    seen = np.zeros(joints)
-    seen[joint] = 1.0
+    seen, count = np.zeros(joints), 0.0
+    for j in joint:
+        count += 1.0 - seen[j]
+        seen[j] = 1.0
     for j in range(joints):
         for c in range(3):
-            mean[c] += seen[j] * points[j, c] / max(seen.sum(), 1.0)
+            mean[c] += seen[j] * points[j, c] / max(count, 1.0)
     for j in range(joints):
         if seen[j] > 0.0:
             x, y, z = points[j, 0] - mean[0], points[j, 1] - mean[1], points[j, 2] - mean[2]
@@ -198,25 +203,28 @@ def _camera_covariance(
 
 @compiled
 def _adjust(
-    rotation: Any, translation: Any, points: Any, first: Any, joint: Any, measured: Any, own: Any, focal: Any,
-    redundancy: Any, most_sigma: Any, mean: Any, precision: Any, freedom: Any, points_known: Any, iterations: Any,
-    tolerance: Any, losses: Any,
+    to_rotation: Any, to_translation: Any, to_points: Any, uv: Any, weight: Any, focal: Any, redundancy: Any,
+    most_sigma: Any, mean: Any, precision: Any, freedom: Any, points_known: Any, iterations: Any, tolerance: Any,
+    inlier: Any, losses: Any,
 ) -> Any:  # fmt: skip
-    """One scene, its state changed in place: norms, sigma, cost, weight of the shape prior, steps, converged."""
-    count, size = len(joint), 0 if points_known else points.size
+    """One scene: sigma, cost, weight of the shape prior, steps, converged."""
+    first, joint, measured, own = detections(uv, weight)
+    rotation, translation, points = to_rotation.copy(), to_translation.copy(), to_points.copy()
+    count, views, joints = len(joint), len(rotation), len(points)
+    size = 0 if points_known else 3 * joints
     seen, error, norm = np.empty((count, 3)), np.empty((count, 2)), np.empty(count)
     trial_seen, trial_error, trial_norm = np.empty((count, 3)), np.empty((count, 2)), np.empty(count)
-    trial_rotation, trial_translation = np.empty_like(rotation), np.empty_like(translation)
-    trial_points = points.copy()
-    irls, whitener, unwanted = np.empty(count), np.empty((len(rotation), 6, 6)), np.empty((0, 6, size + 1))
-    matrix, rhs, pull, trial_pull = np.empty((size, size)), np.empty(size), np.zeros(size), np.zeros(size)
+    trial_rotation, trial_translation = np.empty((views, 3, 3)), np.empty((views, 3))
+    trial_points = np.empty((joints, 3))
+    irls, work, whitener, unwanted = np.empty(count), np.empty(count), np.empty((views, 6, 6)), np.empty((0, 6, 1))
+    matrix, rhs, pull, trial_pull = np.empty((size, size)), np.empty(size), np.empty(size), np.empty(size)
     with_prior = len(precision) > 0 and size > 0
     surprise = trial_surprise = 0.0
 
     project(rotation, translation, points, first, joint, measured, own, focal, seen, error, norm)
     if with_prior:
         surprise = _surprise(points, mean, precision, pull)
-    sigma = min(_robust_sigma(norm) * redundancy, most_sigma)
+    sigma = min(_robust_sigma(norm, work) * redundancy, most_sigma)
     phase, rounds, damping = ROBUST, 0, START_DAMPING
     cost = _cost(norm, sigma, phase, surprise, freedom, size if with_prior else 0)
     step = 0
@@ -245,7 +253,9 @@ def _adjust(
         limit = COARSE if phase == ROBUST else tolerance
         settled = abs(cost - trial_cost) <= limit * cost  # false for NaN, as is the next
         if trial_cost < cost:
-            rotation[:], translation[:], points[:] = trial_rotation, trial_translation, trial_points
+            rotation, trial_rotation = trial_rotation, rotation
+            translation, trial_translation = trial_translation, translation
+            points, trial_points = trial_points, points
             seen, trial_seen = trial_seen, seen
             error, trial_error = trial_error, error
             norm, trial_norm = trial_norm, norm
@@ -258,7 +268,7 @@ def _adjust(
         damping = min(damping, MOST_DAMPING)
         if phase == ROBUST or settled:
             # follow the residuals with the scale of the loss
-            shrunk = min(sigma, _robust_sigma(norm) * redundancy)
+            shrunk = min(sigma, _robust_sigma(norm, work) * redundancy)
             if phase == ROBUST:
                 sigma = shrunk
             if settled:
@@ -269,7 +279,17 @@ def _adjust(
         if len(losses):
             losses[step - 1] = cost
     usual = min(1.0, (freedom + size) / (freedom + surprise)) if with_prior else 1.0
-    return norm, sigma, cost, usual, step, done
+    for n in range(views):
+        for p in range(3):
+            to_translation[n, p] = translation[n, p]
+            for q in range(3):
+                to_rotation[n, p, q] = rotation[n, p, q]
+        for k in range(first[n], first[n + 1]):
+            inlier[n, joint[k]] = norm[k] <= TRIM_SIGMAS * sigma
+    for j in range(joints):
+        for c in range(3):
+            to_points[j, c] = points[j, c]
+    return sigma, cost, usual, float(step), 1.0 if done else 0.0
 
 
 @compiled
@@ -293,13 +313,39 @@ def _next_phase(norm: Any, sigma: Any, phase: Any, shrunk: Any, redundancy: Any)
 
 
 @compiled
-def _robust_sigma(norm: Any) -> Any:
-    """Noise per axis from the (lower) median of all residuals."""
+def _robust_sigma(norm: Any, work: Any) -> Any:
+    """Noise per axis from the (lower) median of all residuals; ``work`` is as long as ``norm``."""
     if len(norm) == 0:
         return 1.0
-    middle = (len(norm) - 1) // 2
-    median = np.partition(norm, middle)[middle] / RAYLEIGH_MEDIAN
-    return max(median, SIGMA_FLOOR_PX) if np.isfinite(median) else 1.0
+    for k in range(len(norm)):
+        work[k] = norm[k]
+    median = _select(work, (len(work) - 1) // 2) / RAYLEIGH_MEDIAN
+    return max(median, SIGMA_FLOOR_PX) if median < np.inf else 1.0
+
+
+@compiled
+def _select(values: Any, rank: Any) -> Any:
+    """The value of the given rank, by Hoare's selection; reorders ``values``."""
+    low, high = 0, len(values) - 1
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if rank <= j:
+            high = j
+        elif rank >= i:
+            low = i
+        else:
+            break
+    return values[rank]
 
 
 @compiled
@@ -359,7 +405,11 @@ def detections(uv: Any, weight: Any) -> Any:
     """Row of the detections of uv [N, 2, J] with weight [N, J] > 0: first [N + 1], joint [K], uv [K, 2], weight [K]."""
     views, joints = weight.shape
     first = np.zeros(views + 1, np.int64)
-    joint, measured, own = np.empty(weight.size, np.int64), np.empty((weight.size, 2)), np.empty(weight.size)
+    count = 0
+    for n in range(views):
+        for j in range(joints):
+            count += weight[n, j] > 0.0
+    joint, measured, own = np.empty(count, np.int64), np.empty((count, 2)), np.empty(count)
     k = 0
     for n in range(views):
         for j in range(joints):
@@ -367,7 +417,7 @@ def detections(uv: Any, weight: Any) -> Any:
                 joint[k], measured[k, 0], measured[k, 1], own[k] = j, uv[n, 0, j], uv[n, 1, j], weight[n, j]
                 k += 1
         first[n + 1] = k
-    return first, joint[:k].copy(), measured[:k].copy(), own[:k].copy()
+    return first, joint, measured, own
 
 
 @compiled
@@ -465,7 +515,8 @@ def reduce_system(
                         square = rows[c, k] * rows[d, k] + rows[c, count + k] * rows[d, count + k]
                         matrix[i, columns[d * count + k]] += square
         for p in range(6):
-            y[p, :width] = 0.0
+            for i in range(width):
+                y[p, i] = 0.0
             total = 0.0
             for q in range(p + 1):
                 factor = w[p, q]
@@ -509,9 +560,9 @@ def _move(
     a, rows, off = np.empty((6, 2 * most)), np.empty((3, 2 * most)), np.empty(2 * most)
     right, step, turn = np.empty(6), np.empty(6), np.empty((3, 3))
     joints = len(change) // 3
-    for j in range(joints):
+    for j in range(len(points)):
         for c in range(3):
-            to_points[j, c] = points[j, c] + change[c * joints + j]
+            to_points[j, c] = points[j, c] + (change[c * joints + j] if joints else 0.0)
     for n in range(len(rotation)):
         r, t, w = rotation[n], translation[n], whitener[n]
         begin, count = first[n], first[n + 1] - first[n]
@@ -524,9 +575,8 @@ def _move(
                     off[count + k] += rows[c, count + k] * moved
         for p in range(6):
             right[p] = _dot(a[p], off, 2 * count)
-        step[:] = 0.0
         for p in range(6):
-            total = 0.0
+            step[p] = total = 0.0
             for q in range(p + 1):
                 total += w[p, q] * right[q]
             for q in range(p + 1):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Literal, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -138,3 +139,8 @@ def focal_of(problem: Problem, state: State) -> Float[Tensor, "b 2"]:
     if "focal" in problem.refine:
         return problem.focal * state.intrinsics[:, problem.refine.index("focal"), None].exp()
     return problem.focal
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """A tensor on the CPU as compiled loops take it."""
+    return tensor.contiguous().numpy()

@@ -7,7 +7,7 @@ from torch import Tensor
 from kronc_ns.geometry.rotations import skew
 from kronc_ns.solve import lm_cpu
 from kronc_ns.solve.bundle import eliminate_cameras, linearise, residuals
-from kronc_ns.solve.problem import Problem, ShapePrior, State
+from kronc_ns.solve.problem import Problem, ShapePrior, State, array
 from kronc_ns.solve.threads import aside
 
 _TRACE = 1e-9
@@ -37,11 +37,13 @@ def _compiled(
 ) -> Float[Tensor, "b n 6 6"]:
     covariance = weight.new_empty(*weight.shape[:2], 6, 6)
     shape = problem.shape or ShapePrior.nothing(weight)
-    tensors = (state.rotation, state.translation, state.points, problem.uv, weight, problem.focal)
-    given = [x.contiguous().numpy() for x in tensors]
-    prior = [x.contiguous().numpy() for x in (variance, variance * shape_weight, shape.precision)]
     with aside():
-        lm_cpu.camera_covariances(*given, _DAMPING, *prior, _TRACE, covariance.numpy())
+        lm_cpu.camera_covariances(
+            *(array(state.rotation), array(state.translation), array(state.points)),
+            *(array(problem.uv), array(weight), array(problem.focal), _DAMPING),
+            *(array(variance), array(variance * shape_weight), array(shape.precision), _TRACE),
+            covariance.numpy(),
+        )
     return covariance
 
 
