@@ -107,7 +107,7 @@ class Bench:
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="kronc_nvs_", ignore_cleanup_errors=True)))
         elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise KroncError(f"--keep {folder} exists already: expected a new or empty folder")
-        # a training is faster on one core beside another than on two after it
+        # as many trainings side by side as there are cores, of one thread each
         environment = {"OMP_NUM_THREADS": "1", "KRONC_NS_CACHE": str(folder.resolve() / "cache")}
         return Trainings(folder.resolve(), stack.enter_context(Commands(environment)))
 
