@@ -26,6 +26,7 @@ from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import flip_camera_axes
 from kronc_ns.keypoints.io import read_json
 from kronc_ns.plugin.cache import read_report, solve_cached
+from kronc_ns.plugin.checks import check_masks, check_not_negative, check_positive
 from kronc_ns.plugin.images import cut_out, downscaled
 from kronc_ns.plugin.seeds import Seeds, box_seeds, grey, ground_seeds
 from kronc_ns.plugin.visual_hull import carve, read_pictures
@@ -77,7 +78,10 @@ class KroncDataParser(DataParser):
         self._solved: tuple[Scene, dict[str, Tensor], dict[str, Any]] | None = None
 
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
+        config = self.config
         with exit_on_error():
+            check_positive(scale_factor=config.scale_factor, scene_scale=config.scene_scale)
+            check_not_negative(num_seed_points=config.num_seed_points)
             if self._solved is None:
                 self._solved = self._solve()
             return self._outputs(split, *self._solved)
@@ -134,6 +138,8 @@ class KroncDataParser(DataParser):
         missing = [path for path in [*images, *(masks or [])] if not path.exists()]
         if missing:
             raise KroncError(f"{missing[0]} does not exist: training needs the images ({len(missing)} are missing)")
+        if masks is not None and config.background != "keep":
+            check_masks(masks)
         seeds = grey(points)
         if split == "train":  # models start from the training views' metadata
             chosen_c2w = torch.stack([poses[PurePosixPath(scene.names[i]).name] for i in indices])

@@ -20,6 +20,11 @@ from kronc_ns.errors import KroncError
 
 _STEPS, _RATE, _RATE_FINAL = 60, 2e-3, 1e-4  # of a test pose: radians, and units of the scene
 _RAYS = 1024
+_LOOK_EVERY = 100  # steps: what is drawn without what is NaN has a finite loss
+_LOST = (
+    "from which training cannot recover: expected finite numbers; go back to the method's defaults, or lower its "
+    "learning rates"
+)
 
 
 @dataclass
@@ -33,10 +38,12 @@ class KroncPipeline(VanillaPipeline):
     """nerfstudio's pipeline, which stops at a loss that is not finite and refines test poses where it has to."""
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
-        """Outputs, losses and metrics of a batch; ends the process with status 2 where a loss is not finite."""
+        """Outputs, losses and metrics of a batch; ends the process with status 2 where training is lost."""
         outputs, losses, metrics = super().get_train_loss_dict(step)
         with exit_on_error():
             check_finite(losses, step)
+            if step % _LOOK_EVERY == _LOOK_EVERY - 1:
+                check_parameters(dict(self.model.named_parameters()), step)
         return outputs, losses, metrics
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
@@ -66,13 +73,16 @@ class KroncPipeline(VanillaPipeline):
 
 def check_finite(losses: Mapping[str, Tensor], step: int) -> None:
     """Raise `KroncError` where a loss is NaN or infinite."""
-    wrong = [name for name, loss in losses.items() if not bool(loss.isfinite().all())]
-    if wrong:
-        value = float(losses[wrong[0]].detach().sum())
-        raise KroncError(
-            f"{wrong[0]} is {value} at step {step}, from which training cannot recover: expected a finite loss; go "
-            "back to the method's defaults, or lower its learning rates"
-        )
+    for name, loss in losses.items():
+        if not bool(loss.isfinite().all()):
+            raise KroncError(f"{name} is {float(loss.detach().sum())} at step {step}, {_LOST}")
+
+
+def check_parameters(parameters: Mapping[str, Tensor], step: int) -> None:
+    """Raise `KroncError` where nothing in a parameter is finite; a single stray Gaussian does no harm."""
+    for name, values in parameters.items():
+        if values.numel() and not bool(values.isfinite().any()):
+            raise KroncError(f"{name} holds no finite number at step {step}, {_LOST}")
 
 
 @torch.enable_grad()

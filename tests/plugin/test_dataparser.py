@@ -412,6 +412,10 @@ def test_options_that_cannot_be_are_named(refused, tmp_path):
     refused("eval_interval is 1", eval_interval=1)
     refused("eval_fraction is 1.5", eval_fraction=1.5)
     refused("downscale_factor is 0", downscale_factor=0)
+    for value in (0.0, -1.0, float("nan"), float("inf")):
+        refused(f"scale_factor is {value:g}", scale_factor=value)
+        refused(f"scene_scale is {value:g}", scene_scale=value)
+    refused("num_seed_points is -1", num_seed_points=-1)
     refused("images_4", "does not exist", downscale_factor=4)
     refused("nowhere", data=tmp_path / "nowhere")
     refused("'nothing'", "phone_walk", config="nothing")

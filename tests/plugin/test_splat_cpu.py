@@ -43,7 +43,7 @@ def random_scene(count: int, cameras: int = 1, size: float = -2.5, bands: int | 
     viewmats = torch.eye(4).repeat(cameras, 1, 1)
     viewmats[:, 0, 3], viewmats[:, 2, 3] = 0.2 * torch.arange(cameras), 3.0
     focal = 1.1 * WIDTH
-    intrinsics = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1.0]]).repeat(cameras, 1, 1)
+    intrinsics = torch.tensor([[focal, 0, WIDTH / 2], [0, 0.8 * focal, HEIGHT / 2], [0, 0, 1.0]]).repeat(cameras, 1, 1)
     return tensors, (viewmats, intrinsics, WIDTH, HEIGHT)
 
 

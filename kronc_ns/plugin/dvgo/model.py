@@ -23,6 +23,7 @@ from torch.nn import Parameter
 
 from kronc_ns.console import exit_on_error
 from kronc_ns.errors import KroncError
+from kronc_ns.plugin.checks import check_not_negative, check_positive, check_shares
 from kronc_ns.plugin.dvgo import equations
 from kronc_ns.plugin.dvgo.field import CoarseField, DensityGridField, FineField, view_rates
 from kronc_ns.plugin.dvgo.grid import UnknownSpace
@@ -80,6 +81,11 @@ class DVGOModel(Model):
         """Fields, renderers and metrics."""
         super().populate_modules()
         config, aabb = self.config, self.scene_box.aabb.float()
+        with exit_on_error():
+            check_not_negative(coarse_iterations=config.coarse_iterations)
+            check_positive(coarse_voxels=config.coarse_voxels, fine_voxels=config.fine_voxels)
+            check_positive(step_size=config.step_size, mlp_width=config.mlp_width)
+            check_shares(coarse_alpha_init=config.coarse_alpha_init, fine_alpha_init=config.fine_alpha_init)
         self.register_buffer("stage", torch.tensor(0))  # 0 coarse, 1 fine
         self.coarse = CoarseField(aabb, config.coarse_voxels, config.coarse_alpha_init)
         self.fine = FineField(aabb, config.fine_alpha_init, config.feature_channels, config.mlp_width)

@@ -48,7 +48,8 @@ def _distances(
     near, far = ray_box(rays.origins, rays.directions, aabb)
     near = near.clamp(min=0) if rays.nears is None else torch.maximum(near, rays.nears[:, 0])
     far = far if rays.fars is None else torch.minimum(far, rays.fars[:, 0])
-    steps = int(((far - near) / step).clamp(min=0).max().ceil()) if len(near) else 0
+    # rays of a camera that is NaN miss everything: what made it so is for the losses to tell
+    steps = int(((far - near) / step).clamp(min=0).nan_to_num().max().ceil()) if len(near) else 0
     offset = torch.rand_like(near) if jitter else torch.full_like(near, 0.5)
     count = torch.arange(steps, device=near.device)
     return near[:, None] + (count + offset[:, None]) * step, far[:, None]
