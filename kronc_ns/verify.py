@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from kronc_ns import objective
 from kronc_ns.adjustment import agrees
+from kronc_ns.geometry.camera import project
+from kronc_ns.geometry.poses import invert, transform
 from kronc_ns.scene import Scene
 from kronc_ns.solve.lm import RAYLEIGH_MEDIAN
 from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
@@ -35,10 +36,9 @@ _ODD_SHAPE = 0.25
 def residuals_px(scene: Scene, solution: Solution) -> Float[Tensor, "n j"]:
     """Reprojection error of every detection against the solved points; NaN where there is none, inf behind a camera."""
     c2w, points = solution.c2w, solution.points
-    uv = objective.reproject(points, c2w, solution.camera)
-    error = (uv - scene.uv).norm(dim=-1)
-    z = ((points - c2w[:, None, :, 3]) * c2w[:, None, :, 2]).sum(-1)
-    error = torch.where(z > 0, error, torch.inf)
+    in_camera = transform(invert(c2w), points.expand(len(c2w), -1, -1))
+    error = (project(in_camera, solution.camera) - scene.uv).norm(dim=-1)
+    error = torch.where(in_camera[..., 2] > 0, error, torch.inf)
     known = (scene.visibility > 0) & c2w.isfinite().all(-1).all(-1)[:, None] & points.isfinite().all(-1)
     return torch.where(known, error, math.nan)
 
