@@ -19,7 +19,7 @@ from kronc_ns.console import exit_on_error
 from kronc_ns.errors import KroncError
 
 _STEPS, _RATE, _RATE_FINAL = 60, 2e-3, 1e-4  # of a test pose: radians, and units of the scene
-_RAYS = 1024
+_RAYS = 512
 _LOOK_EVERY = 100  # steps: what is drawn without what is NaN has a finite loss
 _LOST = (
     "from which training cannot recover: expected finite numbers; go back to the method's defaults, or lower its "

@@ -14,7 +14,7 @@ from kronc_ns.errors import KroncError
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.plugin.compatibility import UnavailableLpips
 from kronc_ns.plugin.dvgo.model import DVGOModelConfig
-from kronc_ns.plugin.pipeline import check_finite, refined_pose
+from kronc_ns.plugin.pipeline import check_finite, check_parameters, refined_pose
 from kronc_ns.plugin.splat_cpu.model import SplatfactoCpuModelConfig
 
 pytestmark = pytest.mark.nerfstudio
@@ -27,6 +27,13 @@ def test_a_loss_that_is_not_finite_is_named(value):
     check_finite({"rgb_loss": torch.tensor(0.2), "tv": torch.tensor(0.0)}, 3)
     with pytest.raises(KroncError, match=rf"tv is {value} at step 17"):
         check_finite({"rgb_loss": torch.tensor(0.2), "tv": torch.tensor(value)}, 17)
+
+
+def test_a_parameter_without_a_finite_number_is_named_and_a_stray_one_is_not():
+    stray = torch.tensor([1.0, math.nan])
+    check_parameters({"means": stray, "none": torch.zeros(0, 3)}, 99)
+    with pytest.raises(KroncError, match="scales holds no finite number at step 99"):
+        check_parameters({"means": stray, "scales": torch.full((4, 3), math.nan)}, 99)
 
 
 def splats():
