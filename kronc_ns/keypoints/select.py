@@ -30,16 +30,8 @@ def select_instances(
         _score(instances[i], box, size, masks[i] if masks else None) for i, box in zip(filled, boxes, strict=True)
     ]
 
-    total, back = scores[0], []
-    for k in range(1, len(filled)):
-        jump = np.abs(boxes[k][:, None] - boxes[k - 1][None]).sum(-1) / (filled[k] - filled[k - 1])
-        candidates = total[None] - _SWITCH_WEIGHT * jump
-        back.append(candidates.argmax(1))
-        total = scores[k] + candidates.max(1)
-    path = [int(total.argmax())]
-    for choices in reversed(back):
-        path.append(int(choices[path[-1]]))
-    for i, instance in zip(filled, reversed(path), strict=True):
+    path = consistent_path(scores, boxes, filled)
+    for i, instance in zip(filled, path, strict=True):
         chosen[i] = instances[i][instance]
 
     several = sum(len(rows) > 1 for rows in instances)
@@ -47,6 +39,31 @@ def select_instances(
         return chosen, "one car in every image that has one"
     how = "overlap with the mask" if masks and any(m is not None for m in masks) else "size and nearness to the centre"
     return chosen, f"{several} images show several cars: the main one was taken by {how}, consistent over the frames"
+
+
+def consistent_path(
+    scores: Sequence[Float[np.ndarray, "_"]], boxes: Sequence[Float[np.ndarray, "_ 4"]], frames: Sequence[int]
+) -> list[int]:
+    """Which instance to take in each of these frames: high scores, without jumps. Exact (dynamic programming).
+
+    ``boxes`` are (centre u, centre v, width, height) in image diagonals; ``frames`` tells how far apart they are.
+    """
+    total, back = scores[0], []
+    for k in range(1, len(frames)):
+        jump = np.abs(boxes[k][:, None] - boxes[k - 1][None]).sum(-1) / (frames[k] - frames[k - 1])
+        candidates = total[None] - _SWITCH_WEIGHT * jump
+        back.append(candidates.argmax(1))
+        total = scores[k] + candidates.max(1)
+    path = [int(total.argmax())]
+    for choices in reversed(back):
+        path.append(int(choices[path[-1]]))
+    return path[::-1]
+
+
+def prominence(boxes: Float[np.ndarray, "m 4"], size: tuple[int, int]) -> Float[np.ndarray, "m"]:
+    """Score of boxes (centre and sides in image diagonals) by size and nearness to the image centre."""
+    centre = np.array(size) / 2 / np.hypot(*size)
+    return np.sqrt(boxes[:, 2] * boxes[:, 3]) * 2 - np.hypot(*(boxes[:, :2] - centre).T)
 
 
 def _boxes(rows: Float[np.ndarray, "m j 3"], size: tuple[int, int]) -> Float[np.ndarray, "m 4"]:
@@ -69,5 +86,4 @@ def _score(
         row = np.clip(rows[..., 1].astype(int), 0, mask.shape[0] - 1)
         inside = (mask[row, column] > 0) & seen
         return inside.sum(1) / np.maximum(seen.sum(1), 1) + 0.01 * inside.sum(1)
-    centre = np.array(size) / 2 / np.hypot(*size)
-    return np.sqrt(boxes[:, 2] * boxes[:, 3]) * 2 - np.hypot(*(boxes[:, :2] - centre).T)
+    return prominence(boxes, size)

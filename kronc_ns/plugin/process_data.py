@@ -3,6 +3,7 @@
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Annotated, Union
 
@@ -14,6 +15,8 @@ from kronc_ns.capture.detection.detector import Detector
 from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, find_frames, prepare_frames
 from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics
 from kronc_ns.capture.masks import find_masks, write_masks
+from kronc_ns.capture.segmentation.choice import SegmenterOptions, segment_car
+from kronc_ns.capture.segmentation.segmenter import Segmenter
 from kronc_ns.capture.source import MIN_FRAMES, Source, find_source
 from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
@@ -44,6 +47,8 @@ class KroncToNerfstudio:
     """How keypoints are found, where no file holds them."""
     masks: Path | None = None
     """Folder with a mask for each image, of the same stem: above 127 the car, else ignored."""
+    segmentation: Annotated[SegmenterOptions, tyro.conf.arg(name="")] = field(default_factory=SegmenterOptions)
+    """How masks are made, where there are none."""
     fps: float = 5.0
     """Frames per second taken from a video."""
     num_frames_target: int | None = None
@@ -68,7 +73,7 @@ class KroncToNerfstudio:
         """Process; raises `KroncError` for what the user can mend. Returns 3 for a doubtful solution, else 0."""
         config = self.solve.solver_config()
         self._check_options()
-        detector = self.detection.make()
+        detector, segmenter = self.detection.make(), self.segmentation.make()
         source = find_source(self.data)
         size = check_source(source)
         found = None if detector else self._read_keypoints(source)
@@ -89,7 +94,7 @@ class KroncToNerfstudio:
         intrinsics = early or self._intrinsics(source, frames.size)
         if intrinsics.assumed:
             print(_assumption(intrinsics), file=sys.stderr)
-        masks = self._write_masks(source, frames)
+        masks, mask_note = self._write_masks(segmenter, source, frames)
         transforms = transforms_dict(
             intrinsics.camera, frames.names, source.c2w, masks, copy_depths(source, frames, out)
         )
@@ -112,6 +117,8 @@ class KroncToNerfstudio:
         levels = "".join(f", 1/{factor}" for factor in frames.factors)
         origin = "as an earlier run left them" if frames.reused else f"from {source.kind} {self.data}"
         table.add_row("frames", f"{len(frames.names)} of {frames.size[0]}x{frames.size[1]}{levels}, {origin}")
+        if mask_note:
+            table.add_row("masks", mask_note)
         table.add_row("keypoints", _seen(scene))
         refined = f", refined to {solution.camera.fx:.1f} px" if config.refine_focal else ""
         table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}{refined}")
@@ -133,6 +140,8 @@ class KroncToNerfstudio:
             raise KroncError(f"--data {self.data} lies in --output-dir {self.output_dir}: choose another output folder")
         if self.keypoints is not None and self.detection.detector is not None:
             raise KroncError(f"--keypoints {self.keypoints} and --detector {self.detection.detector}: give one of them")
+        if self.masks is not None and self.segmentation.segmenter is not None:
+            raise KroncError(f"--masks {self.masks} and --segmenter {self.segmentation.segmenter}: give one of them")
         if self.masks is not None and not self.masks.is_dir():
             raise KroncError(f"--masks {self.masks} is no folder: expected one mask image per photo, of the same stem")
 
@@ -154,9 +163,17 @@ class KroncToNerfstudio:
     def _intrinsics(self, source: Source, size: tuple[int, int]) -> Intrinsics:
         return find_intrinsics(size, source.images, source.camera, self.focal_length_px, self.fov_deg)
 
-    def _write_masks(self, source: Source, frames: Frames) -> tuple[str, ...] | None:
+    def _write_masks(
+        self, segmenter: Segmenter | None, source: Source, frames: Frames
+    ) -> tuple[tuple[str, ...] | None, str]:
+        """Paths of the masks, if there are any, and a note on how they were made."""
+        out = self.output_dir
+        if segmenter is not None:
+            with TemporaryDirectory(prefix="kronc-masks-") as folder, progress_bar("segmenting") as progress:
+                files, note = segment_car(segmenter, [out / name for name in frames.names], Path(folder), progress)
+                return write_masks(files, frames, out), note
         masks = self.masks or source.masks
-        return None if masks is None else write_masks(find_masks(masks, frames), frames, self.output_dir)
+        return (None if masks is None else write_masks(find_masks(masks, frames), frames, out)), ""
 
 
 def extend_commands(script: ModuleType) -> None:

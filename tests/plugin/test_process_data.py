@@ -1,5 +1,6 @@
 """`kronc-process-data`: from photos, scene folders and videos to a dataset nerfstudio trains on, or one clear line."""
 
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -14,6 +15,7 @@ import torch
 from PIL import Image
 
 from kronc_ns.capture.detection.choice import DetectorOptions
+from kronc_ns.capture.segmentation.choice import SegmenterOptions
 from kronc_ns.config import SolverOptions
 from kronc_ns.evaluate import evaluate_poses
 from kronc_ns.export import MARKER
@@ -23,6 +25,7 @@ from kronc_ns.plugin.process_data import KroncToNerfstudio
 from kronc_ns.scene import load_scene, read_poses
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, make_capture
+from tests.capture.detection.dots import Net
 
 VIEWS = 12
 HASTY = "solver: adam\nadam:\n  steps: 3\n"  # too little for anything
@@ -369,6 +372,25 @@ def test_detectors_that_cannot_run_are_named_before_anything_is_written(
     assert _status(KroncToNerfstudio(data=scene, output_dir=out, detection=detection)) == 2
     assert message in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_segmenter_makes_the_masks(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("KRONC_NS_CACHE", str(tmp_path / "cache"))
+    net, out = Net(), tmp_path / "out"
+    column = net.constant(np.where(np.arange(64) < 32, 1.0, 0.0)[None, None, None])
+    left = net("Add", net("Mul", net("ReduceMean", "image", axes=[1], keepdims=1), net.constant(0.0)), column)
+    weights = net.save(tmp_path / "net.onnx", [1, 3, 64, 64], {"saliency": (left, [1, 1, 64, 64])})
+    command = KroncToNerfstudio(data=scene, output_dir=out, segmentation=SegmenterOptions("saliency", weights))
+    assert _status(command) == 0
+    assert "12 of 12 frames" in capsys.readouterr().out
+    for folder, width in (("masks", 480), ("masks_2", 240)):
+        mask = np.array(Image.open(out / folder / "frame_00001.png"))
+        assert (mask[:, : width // 2 - 8] == 255).all()
+        assert (mask[:, width // 2 + 8 :] == 0).all()
+    assert _status(dataclasses.replace(command, masks=scene / "masks")) == 2
+    assert "and --segmenter saliency: give one of them" in capsys.readouterr().err
 
 
 def test_keypoints_and_a_detector_are_one_too_many(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

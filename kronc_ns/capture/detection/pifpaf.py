@@ -4,10 +4,12 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from PIL import Image
+
 from kronc_ns.capture.detection.detector import CarDetection, CarImage, bounds
 from kronc_ns.capture.detection.environment import VERSION, Environment, find_environment
 from kronc_ns.capture.detection.model import file_sha256
-from kronc_ns.capture.detection.pixels import MAX_LONG_SIDE
+from kronc_ns.capture.detection.pixels import MAX_LONG_SIDE, is_transparent, read_rgb
 from kronc_ns.capture.images import upright_size
 from kronc_ns.errors import KroncError
 from kronc_ns.keypoints.io import openpifpaf_rows, read_json, read_predictions, read_schema
@@ -35,10 +37,7 @@ class OpenPifPafDetector:
         """The cars in each image, as the child writes them."""
         with TemporaryDirectory(prefix="kronc-openpifpaf-") as temporary:
             folder = Path(temporary)
-            # links: names that are all different, plain and short, whatever the images are called
-            names = [f"{number:06d}{image.path.suffix.lower()}" for number, image in enumerate(images)]
-            for name, image in zip(names, images, strict=True):
-                (folder / name).symlink_to(image.path.resolve())
+            names = [_offer(image.path, folder, number) for number, image in enumerate(images)]
             (folder / "found").mkdir()  # without it, every image would overwrite one file of this name
             with self._environment.run([*self._arguments(images), *names], folder) as child:
                 for name in names:
@@ -70,6 +69,20 @@ class OpenPifPafDetector:
             for i in range(len(instances))
             if (confidence[i] > 0).any()
         ]
+
+
+def _offer(image: Path, folder: Path, number: int) -> str:
+    """Link an image into ``folder`` under a name that is plain and its own, whatever it is called elsewhere.
+
+    OpenPifPaf would show its network the colours of transparent pixels: such images are drawn on white.
+    """
+    if is_transparent(image):
+        name = f"{number:06d}.png"
+        Image.fromarray(read_rgb(image)).save(folder / name)
+    else:
+        name = f"{number:06d}{image.suffix.lower()}"
+        (folder / name).symlink_to(image.resolve())
+    return name
 
 
 def find_checkpoint(given: Path | None) -> tuple[str, str, KeypointSchema]:

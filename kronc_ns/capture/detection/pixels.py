@@ -35,10 +35,20 @@ class Placement:
 def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """The image as it is stored; where it is transparent, white shines through."""
     image = load_image(path)
-    if image.mode in ("P", "LA", "RGBA", "PA") or "transparency" in image.info:
+    if _is_transparent(image):
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
     return np.array(image.convert("RGB"))
+
+
+def is_transparent(path: Path) -> bool:
+    """Whether the file has transparent pixels, whose colours mean nothing; from the header alone."""
+    with Image.open(path) as image:
+        return _is_transparent(image)
+
+
+def _is_transparent(image: Image.Image) -> bool:
+    return image.mode in ("LA", "RGBA", "PA") or "transparency" in image.info
 
 
 def box_of_mask(mask: Path, size: tuple[int, int]) -> Float[np.ndarray, "4"] | None:

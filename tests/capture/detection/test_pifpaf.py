@@ -83,6 +83,13 @@ def test_names_may_be_anything(tmp_path: Path, fake):
     assert [len(cars) for cars in detector.detect(photos(tmp_path / "größe", names))] == [1] * 5
 
 
+def test_transparent_pixels_are_offered_as_white(tmp_path: Path, fake):
+    rgba = np.zeros((20, 30, 4), dtype=np.uint8)
+    body = "from PIL import Image\nassert Image.open(images[0]).getpixel((0, 0)) == (255, 255, 255)\n"
+    body += "write(images[0], [])\n"
+    assert list(OpenPifPafDetector(None, fake(body)).detect([CarImage(save(tmp_path / "a.png", rgba))])) == [[]]
+
+
 def test_large_frames_are_scaled_down(tmp_path: Path, fake):
     image = save(tmp_path / "large.jpg", np.zeros((1200, 2400, 3), dtype=np.uint8))
     list(OpenPifPafDetector(None, fake("write(images[0], [])\n")).detect([CarImage(image)]))
