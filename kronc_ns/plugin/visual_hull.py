@@ -82,7 +82,10 @@ def _pixels(
 
 
 def _occupied(pictures: Pictures, c2w: Float[Tensor, "n 3 4"], points: Float[Tensor, "p 3"]) -> Bool[Tensor, "p"]:
-    """Which points hardly any view contradicts; those that are already contradicted are not looked at again."""
+    """Which points hardly any view contradicts.
+
+    One view after the other, since after a few of them most points are contradicted and need not be looked at again.
+    """
     most = max(1, round(_DISSENT * len(c2w)))
     against = torch.zeros(len(points), dtype=torch.int16)
     watched = torch.zeros(len(points), dtype=torch.int16)
@@ -116,7 +119,10 @@ def _buried(inside: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
 def _colours(
     pictures: Pictures, c2w: Float[Tensor, "n 3 4"], points: Float[Tensor, "p 3"], voxel: float
 ) -> tuple[Float[Tensor, "p 3"], Bool[Tensor, "p"]]:
-    """Mean colour over the views that see a point first along its ray, and whether any does."""
+    """Mean colour over the views that see a point first along its ray, and whether any does.
+
+    One view after the other: the depth images of hundreds of views would take gigabytes, and save no time.
+    """
     camera = pictures.camera
     total = torch.zeros(len(points), 3, dtype=torch.float64)
     count = torch.zeros(len(points), dtype=torch.float64)

@@ -178,12 +178,12 @@ def test_empty_masks_do_not_matter_to_the_full_frame(method, painted, tmp_path, 
         ("kronc_dvgo_cpu", "camera_opt"),
     ],
 )
-def test_a_rate_that_is_no_number_ends_training_early(method, group, rendered, tmp_path, capsys):
+def test_an_infinite_rate_ends_training_early(method, group, rendered, tmp_path, capsys):
     config = getattr(methods, method).config
     camera_optimizer = replace(config.pipeline.model.camera_optimizer, mode="SO3xR3")
     model = SMALL[method] | {"camera_optimizer": camera_optimizer}
     with pytest.raises(SystemExit) as ended:
-        train(method, rendered(), tmp_path, model=model, steps=10_000, rates={group: math.nan})
+        train(method, rendered(), tmp_path, model=model, steps=10_000, rates={group: math.inf})
     assert ended.value.code == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert "training cannot recover" in error
