@@ -22,12 +22,23 @@ from kronc_ns.errors import KroncError
 from kronc_ns.files import atomic_path, write_json
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import flip_camera_axes, invert
-from kronc_ns.keypoints.io import read_json
+from kronc_ns.keypoints.io import read_json, write_keypoints
+from kronc_ns.provenance import provenance
 from kronc_ns.scene import Scene, camera_and_frames, read_poses
 from kronc_ns.solve.solution import Solution
 
 MARKER = ".kronc-incomplete"
 """Present in an output folder from the first byte until kronc.json is written."""
+
+
+REPORT_FILE = "report.html"
+_REPORT_MARK = '<meta name="generator" content="kronc_ns'
+
+
+def is_report(file: Path) -> bool:
+    """Whether ``file`` is an HTML report of ours."""
+    with file.open(encoding="utf-8", errors="replace") as start:
+        return _REPORT_MARK in start.read(1000)
 
 
 def claim_output(folder: Path) -> None:
@@ -47,6 +58,9 @@ def claim_output(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MARKER).touch()
         (folder / "kronc.json").unlink(missing_ok=True)
+        report = folder / REPORT_FILE
+        if report.is_file() and is_report(report):  # of the earlier result
+            report.unlink()
     except OSError as error:
         raise KroncError(f"{folder} cannot be written: {error.strerror}") from None
 
@@ -95,13 +109,13 @@ def transforms_dict(
 
 
 def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, inputs: str) -> dict[str, Any]:
-    """Write transforms.json, kronc.json and the keypoint cloud of a claimed ``folder``, and release it.
+    """Write transforms.json, kronc.json, keypoints.json and the keypoint cloud of a claimed ``folder``; release it.
 
     ``data`` is the folder that ``scene`` was read from (image paths are written relative to ``folder``);
     ``inputs`` is the `fingerprint` of what was solved. Returns the content of kronc.json.
     """
-    names = [_relative(data, name, folder) for name in solution.names]
-    masks = [_relative(data, mask, folder) for mask in scene.masks] if scene.masks else None
+    names = [relative_path(data, name, folder) for name in solution.names]
+    masks = [relative_path(data, mask, folder) for mask in scene.masks] if scene.masks else None
     content = transforms_dict(solution.camera, names, solution.c2w, masks)
     known = solution.points[solution.points.isfinite().all(-1)]
     (folder / "keypoints.ply").unlink(missing_ok=True)
@@ -110,7 +124,16 @@ def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, i
         with atomic_path(folder / "keypoints.ply") as path:
             trimesh.PointCloud(known.numpy(), colors=np.tile([[200, 40, 40, 255]], (len(known), 1))).export(path)
     write_json(folder / "transforms.json", content)
-    report = {**solution_dict(solution), "keypoint_schema": scene.schema.name, "inputs": inputs}
+    if folder.resolve() != data.resolve():  # where they stand already
+        rows = dict(zip(names, scene.keypoints.numpy(), strict=True))
+        write_keypoints(folder / "keypoints.json", scene.schema, (scene.camera.width, scene.camera.height), rows)
+    report = {
+        **solution_dict(solution),
+        "keypoint_schema": scene.schema.name,
+        "inputs": inputs,
+        "data": relative_path(data, ".", folder),
+        **provenance(),
+    }
     write_json(folder / "kronc.json", report)
     release_output(folder)
     return report
@@ -135,6 +158,7 @@ def solution_dict(solution: Solution) -> dict[str, Any]:
         ],
         "points": [[_number(x) for x in point] for point in solution.points.tolist()],
         "history": {key: [_number(x) for x in values] for key, values in solution.history.items()},
+        "initial_c2w": [_rounded(pose) for pose in solution.initial_c2w.flatten(1).tolist()],
     }
 
 
@@ -142,7 +166,13 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _relative(data: Path, name: str, folder: Path) -> str:
+def _rounded(pose: list[float]) -> list[float] | None:
+    """The twelve numbers of a pose, row by row, as exact as a picture needs them; None where there is none."""
+    return [round(x, 5) for x in pose] if all(map(math.isfinite, pose)) else None
+
+
+def relative_path(data: Path, name: str, folder: Path) -> str:
+    """The path ``name`` of a scene in ``data``, as seen from ``folder``."""
     return Path(os.path.relpath((data / name).resolve(), folder.resolve())).as_posix()
 
 

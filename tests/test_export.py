@@ -191,7 +191,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))])
-@pytest.mark.parametrize("file", ["keypoints.ply", "transforms.json", "kronc.json"])
+@pytest.mark.parametrize("file", ["keypoints.ply", "transforms.json", "keypoints.json", "kronc.json"])
 def test_an_interrupted_write_is_marked_and_the_next_one_works(
     solved, walk_folder, scene, solution, monkeypatch, file, error
 ):
@@ -211,7 +211,7 @@ def test_an_interrupted_write_is_marked_and_the_next_one_works(
     assert not (solved / "kronc.json").exists()
     claim_output(solved)
     write_solution(solved, scene, solution, walk_folder, "abc")
-    assert sorted(os.listdir(solved)) == ["keypoints.ply", "kronc.json", "transforms.json"]
+    assert sorted(os.listdir(solved)) == ["keypoints.json", "keypoints.ply", "kronc.json", "transforms.json"]
 
 
 def test_inputs_are_the_fingerprint_of_what_was_solved(tmp_path, walk_folder, scene, solution):
