@@ -202,12 +202,29 @@ class Export:
         return 0
 
 
+@dataclass(kw_only=True)
+class Report:
+    """Write report.html: cameras before and after, keypoints over images, residuals, every view; in a single file."""
+
+    data: Path
+    """Folder that `kronc solve` or `ns-process-data kronc` wrote; gets report.html."""
+
+    def run(self) -> int:
+        """Write the report."""
+        # plotly takes half a second, which no other command needs
+        from kronc_ns.report import write_report
+
+        print(write_report(self.data))
+        return 0
+
+
 Command = (
     Annotated[Solve, tyro.conf.subcommand("solve")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[ConvertDetector, tyro.conf.subcommand("convert-detector")]
 )
 

@@ -29,6 +29,8 @@ with jaxtyping.install_import_hook(
         "kronc_ns.completion",
         "kronc_ns.evaluate",
         "kronc_ns.image_metrics",
+        "kronc_ns.solved",
+        "kronc_ns.report",
     ],
     "beartype.beartype",
 ):
@@ -39,7 +41,9 @@ with jaxtyping.install_import_hook(
     import kronc_ns.keypoints.select
     import kronc_ns.objective
     import kronc_ns.repair
-    import kronc_ns.solve.adam  # noqa: F401
+    import kronc_ns.report
+    import kronc_ns.solve.adam
+    import kronc_ns.solved  # noqa: F401
 
 import torch
 

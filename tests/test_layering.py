@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "kronc_ns"
 LAYERS = [
-    {"errors", "files", "compiled"},
+    {"errors", "files", "compiled", "provenance"},
     {"geometry"},
     {"keypoints"},
     {"scene"},
@@ -17,7 +17,7 @@ LAYERS = [
     {"adjustment", "repair"},
     {"verify"},
     {"pipeline"},
-    {"config", "evaluate", "image_metrics", "capture", "export", "report", "plots", "viewer"},
+    {"config", "evaluate", "image_metrics", "capture", "export", "solved", "report", "plots", "viewer"},
     {"synthetic", "console", "benchmark"},
     {"batch"},
     {"cli", "plugin"},
