@@ -20,7 +20,7 @@ from kronc_ns.errors import KroncError
 from kronc_ns.files import atomic_path, cache_folder
 from kronc_ns.keypoints.select import consistent_path, prominence
 
-SegmenterName: TypeAlias = Literal["maskrcnn", "saliency"]
+SegmenterName: TypeAlias = Literal["maskrcnn", "mask2former", "saliency"]
 
 
 @dataclass
@@ -28,10 +28,11 @@ class SegmenterOptions:
     """How masks are made."""
 
     segmenter: SegmenterName | None = None
-    """Make the masks with torchvision's Mask R-CNN (cars, buses, trucks), or with a saliency network of the U2-Net
-    family as ONNX, for one car before a calm background."""
+    """Make the masks with torchvision's Mask R-CNN, with Mask2Former (both: cars, buses, trucks), or with a saliency
+    network of the U2-Net family as ONNX, for one car before a calm background."""
     segmenter_weights: Path | None = None
-    """Weights of the segmenter (default for maskrcnn: torchvision's, downloaded)."""
+    """Weights of the segmenter: a file, for mask2former a folder or a name on the Hugging Face hub (default, but not
+    for saliency: the published ones, downloaded)."""
 
     def make(self) -> Segmenter | None:
         """The segmenter, ready to run, if one was chosen; raises `KroncError` for what is missing."""
@@ -44,6 +45,10 @@ class SegmenterOptions:
                 from kronc_ns.capture.segmentation.mask_rcnn import MaskRcnnSegmenter
 
                 return MaskRcnnSegmenter(self.segmenter_weights)
+            case "mask2former":
+                from kronc_ns.capture.segmentation.mask2former import Mask2FormerSegmenter
+
+                return Mask2FormerSegmenter(self.segmenter_weights)
             case "saliency":
                 from kronc_ns.capture.segmentation.saliency import SaliencySegmenter
 

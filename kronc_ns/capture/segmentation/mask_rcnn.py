@@ -9,10 +9,9 @@ import torch
 from jaxtyping import UInt8
 
 from kronc_ns.capture.detection.model import file_sha256
-from kronc_ns.capture.segmentation.segmenter import MAX_CARS, label_map
+from kronc_ns.capture.segmentation.segmenter import MAX_CARS, VEHICLES, label_map
 from kronc_ns.errors import KroncError
 
-_VEHICLES = ("car", "bus", "truck")
 _MIN_SCORE = 0.5
 _ON_CAR = 0.5
 
@@ -26,7 +25,7 @@ class MaskRcnnSegmenter:
         published = MaskRCNN_ResNet50_FPN_V2_Weights.COCO_V1
         file = weights or Path(torch.hub.get_dir()) / "checkpoints" / published.url.rsplit("/", 1)[-1]
         names = published.meta["categories"]
-        self._vehicles = torch.tensor([names.index(name) for name in _VEHICLES])
+        self._vehicles = torch.tensor([names.index(name) for name in VEHICLES])
         model: Any = maskrcnn_resnet50_fpn_v2(
             weights=None, weights_backbone=None, num_classes=len(names), box_detections_per_img=MAX_CARS
         )

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+VEHICLES = ("car", "bus", "truck")
+"""What COCO calls the things that a walk may go around."""
 MAX_CARS = 20
 _SMALLEST_SHARE = 5e-4  # of the image; what is smaller is noise
 

@@ -1,6 +1,7 @@
 """Masks of one car over all frames: from dots in pictures, from a stand-in for Mask R-CNN, from genuine weights."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import cv2
@@ -197,6 +198,43 @@ def test_the_real_mask_rcnn_runs_with_untrained_weights(tmp_path: Path):
     torch.save(maskrcnn_resnet50_fpn_v2(weights=None, weights_backbone=None, num_classes=91).state_dict(), file)
     labels = MaskRcnnSegmenter(file).segment(np.zeros((120, 200, 3), dtype=np.uint8))
     assert labels.shape == (120, 200)
+
+
+@pytest.mark.slow
+def test_the_real_mask2former_with_few_untrained_weights(tmp_path: Path):
+    from transformers import Mask2FormerConfig, Mask2FormerForUniversalSegmentation, Mask2FormerImageProcessor
+    from transformers.models.swin import SwinConfig
+
+    from kronc_ns.capture.segmentation.mask2former import Mask2FormerSegmenter
+
+    torch.manual_seed(0)
+    backbone = SwinConfig(
+        embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 1, 1], out_features=["stage1", "stage2", "stage3", "stage4"]
+    )
+    small = {"feature_size": 32, "mask_feature_size": 32, "hidden_dim": 32, "dim_feedforward": 32, "num_queries": 4}
+    config = Mask2FormerConfig(
+        backbone_config=backbone, encoder_layers=1, decoder_layers=2, num_attention_heads=2,
+        encoder_feedforward_dim=32, id2label={0: "person", 1: "car"}, label2id={"person": 0, "car": 1}, **small,
+    )  # fmt: skip
+    model = Mask2FormerForUniversalSegmentation(config)
+    model.class_predictor.bias.data = torch.tensor([-9.0, 9.0, -9.0])  # everything is a car
+    model.save_pretrained(tmp_path / "model")
+    Mask2FormerImageProcessor(size={"height": 64, "width": 64}).save_pretrained(tmp_path / "model")
+    rgb = np.random.default_rng(0).integers(0, 255, (90, 120, 3), dtype=np.uint8)
+    labels = Mask2FormerSegmenter(tmp_path / "model").segment(rgb)
+    assert labels.shape == (90, 120)
+    assert 1 <= labels.max() <= 4
+    model.class_predictor.bias.data = torch.tensor([9.0, -9.0, -9.0])
+    model.save_pretrained(tmp_path / "model")
+    assert Mask2FormerSegmenter(tmp_path / "model").segment(rgb).max() == 0
+    with pytest.raises(KroncError, match=r"nowhere cannot be loaded .*--segmenter-weights a folder"):
+        Mask2FormerSegmenter(tmp_path / "nowhere")
+
+
+def test_without_transformers_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(KroncError, match=r"pip install 'kronc-ns\[mask2former\]'"):
+        SegmenterOptions("mask2former").make()
 
 
 def test_options_that_do_not_fit_are_named():
