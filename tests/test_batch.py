@@ -61,7 +61,7 @@ def test_every_folder_gets_its_own_result(captures, solve, tmp_path):
     status, printed, err = solve(*(captures / name for name in NAMES), output=out)
     assert (status, err) == (0, "")
     assert sorted(path.name for path in out.iterdir()) == list(NAMES)
-    files = ["keypoints.ply", "kronc.json", "transforms.json"]
+    files = ["keypoints.json", "keypoints.ply", "kronc.json", "transforms.json"]
     for name in NAMES:
         assert sorted(path.name for path in (out / name).iterdir()) == files
         assert report(out / name)["status"] == "converged"
