@@ -280,7 +280,7 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig) -> Solution:
         camera=start.scene.camera,
         c2w=c2w,
         points=points,
-        depths=torch.where(scene.visibility > 0, depths, math.nan),
+        depths=torch.where(start.scene.visibility > 0, depths, math.nan),
         views=(),
         initial_c2w=attempt.initial_c2w,
         solver=config.solver,

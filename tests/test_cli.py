@@ -129,7 +129,7 @@ def test_synth_solve_eval_export(scene, short, kronc, tmp_path):
     assert result.out.splitlines()[-1] == str(out / "transforms.json")
     assert "12 of 12" in result.out
     assert contents(scene) == before
-    assert sorted(os.listdir(out)) == ["keypoints.ply", "kronc.json", "transforms.json"]
+    assert sorted(os.listdir(out)) == ["keypoints.json", "keypoints.ply", "kronc.json", "transforms.json"]
     assert json.loads((out / "kronc.json").read_text())["status"] == "converged"
 
     judged = kronc("eval", "--poses", out / "transforms.json", "--reference", scene / "reference.json", "--json")

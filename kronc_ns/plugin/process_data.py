@@ -26,6 +26,7 @@ from kronc_ns.files import write_json
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.io import FORMATS, Detections, read_keypoints, write_keypoints
 from kronc_ns.pipeline import fingerprint, solve_scene
+from kronc_ns.report import write_report
 from kronc_ns.scene import Scene, load_scene, match_keypoints
 from kronc_ns.starts import MIN_POINTS
 
@@ -122,6 +123,7 @@ class KroncToNerfstudio:
         table.add_row("keypoints", _seen(scene))
         refined = f", refined to {solution.camera.fx:.1f} px" if config.refine_focal else ""
         table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}{refined}")
+        table.add_row("report", str(write_report(out)))
         Console().print(table)
         status = exit_status(report)
         if status == 0:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import html
 import json
 import shutil
 import subprocess
@@ -112,6 +113,7 @@ def test_scene_folder_to_dataset(scene: Path, tmp_path: Path, capture: Capture, 
     assert errors["registered"] == VIEWS
     assert errors["rotation_deg"]["max"] < 0.01
     assert not (out / MARKER).exists()
+    assert "images/frame_00001.jpg" in (out / "report.html").read_text(encoding="utf-8")
     assert json.loads((out / "kronc.json").read_text())["status"] == "converged"
     content = json.loads((out / "transforms.json").read_text())
     assert content["frames"][0]["file_path"] == "images/frame_00001.jpg"
@@ -250,7 +252,9 @@ def test_a_doubtful_solution_is_written_and_ends_with_3(
     assert printed.err.startswith("failed: ")
     assert len(printed.err.strip().splitlines()) == 1
     assert "ns-train" not in printed.out
-    assert json.loads((out / "kronc.json").read_text())["status"] == "failed"
+    told = json.loads((out / "kronc.json").read_text())
+    assert told["status"] == "failed"
+    assert html.escape(told["reason"].split(";")[0]) in (out / "report.html").read_text(encoding="utf-8")
     assert not (out / MARKER).exists()
 
 
