@@ -34,7 +34,7 @@ from kronc_ns.solve.threads import one_thread, turn
 from kronc_ns.starts import Start, circles, start_from_poses, start_from_template, usable_views
 from kronc_ns.verify import Evidence, verify
 
-_FORMAT = 2  # raised whenever the same input and options give another solution
+_FORMAT = 3  # raised whenever the same input and options give another solution
 _TOGETHER = 4  # scenes that go through the stages together
 _CONTRADICTED = 0.5  # of the mean distance from their middle: given centres that are off by more are no use
 _PROMISING = 2  # of the circles, those whose odd views are located anew
