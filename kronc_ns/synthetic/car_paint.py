@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from kronc_ns.synthetic.car_parts import CarShape, deck_height, tail_height
+from kronc_ns.synthetic.texture import mip_levels
 
 METRES_PER_TEXEL = 0.0025
 Rgb = tuple[int, int, int]
@@ -82,16 +83,6 @@ class _Canvas:
         """The finished texture. Colour outside the features is zero, so antialiased edges come out premultiplied."""
         image = cv2.merge([self.rgb, self.rest])
         return Layer(self.facing, self.right, self.up, self.corner, mip_levels(image), min_cos)
-
-
-def mip_levels(image: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The image [H,W,C] and its successive halvings, each the mean over 2 x 2 texels."""
-    levels = [image]
-    while min(levels[-1].shape[:2]) > 8:
-        height, width = (n // 2 * 2 for n in levels[-1].shape[:2])
-        rows = levels[-1][:height:2, :width].astype(np.uint16) + levels[-1][1:height:2, :width]
-        levels.append(((rows[:, ::2] + rows[:, 1::2] + 2) // 4).astype(np.uint8))
-    return tuple(levels)
 
 
 def _arc(centre: tuple[float, float], radius: float, start_deg: float, stop_deg: float) -> np.ndarray:

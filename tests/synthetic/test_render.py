@@ -9,7 +9,8 @@ import pytest
 
 from kronc_ns.synthetic.car import CarModel, build_car
 from kronc_ns.synthetic.car_parts import CarShape
-from kronc_ns.synthetic.render import Rendering, _ground_levels, _wall_levels, keypoint_visibility, render_view
+from kronc_ns.synthetic.render import Rendering, keypoint_visibility, render_view
+from kronc_ns.synthetic.surroundings import ground_levels, wall_levels
 
 SIZE, FOCAL = 96, 82.0
 REAR, FRONT = [22, 23, 25, 26, 31, 32, 34, 35], [0, 1, 2, 3, 54, 55, 56, 57]
@@ -140,8 +141,8 @@ def test_a_rebuilt_car_differs_only_in_its_paint(car: CarModel) -> None:
 
 def test_background_is_deterministic(car: CarModel) -> None:
     first = view(car, ring_pose(200), ground=True)
-    _ground_levels.cache_clear()
-    _wall_levels.cache_clear()
+    ground_levels.cache_clear()
+    wall_levels.cache_clear()
     np.testing.assert_array_equal(first.rgba, view(car, ring_pose(200), ground=True).rgba)
 
 
