@@ -68,9 +68,9 @@ def triangulate(
     c2w: Float[Tensor, "n 3 4"], rays: Float[Tensor, "n j 3"], m: Float[Tensor, "n j"]
 ) -> Float[Tensor, "j 3"]:
     """Points nearest to all the rays (K^-1 (u, v, 1)) that see them; the cameras' mean centre where none does."""
-    direction = torch.nn.functional.normalize(rays, dim=-1) @ c2w[..., :3].transpose(-1, -2)
-    centre = c2w[:, None, :, 3]
-    along = (direction * centre).sum(-1, keepdim=True)
+    ones = rays.new_ones(3)  # a product with it is several times faster than a sum over three
+    direction = (rays / (rays.square() @ ones).sqrt()[..., None]) @ c2w[..., :3].transpose(-1, -2)
+    along = direction @ c2w[..., 3:]
     # sum of m (I - d d^T), and of the same times the centres; a trace of the identity where rays are parallel
     weighted = m[..., None] * direction
     outer = torch.einsum("nja,njb->jab", weighted, direction)

@@ -118,20 +118,26 @@ def _relative_covariances(
         covariance[:] = np.nan
         return
     _forward(matrix, gauge)
+    shared = np.empty((7, 7))
+    for p in range(7):
+        for q in range(7):
+            shared[p, q] = _dot(gauge[p], gauge[q], size)
     for n in range(len(rotation)):
         z = whitened[n]
         _forward(matrix, z)
-        _camera_covariance(rotation[n], translation[n], mean, whitener[n], z, gauge, inverse, variance, covariance[n])
+        _camera_covariance(
+            rotation[n], translation[n], mean, whitener[n], z, gauge, shared, inverse, variance, covariance[n]
+        )
 
 
 @compiled
 def _gauge(points: Any, joint: Any, trace: Any) -> Any:
-    """Orthonormal directions [8, 3J] in which shift, turn and growth of the world move the points that are seen.
+    """Orthonormal directions [12, 3J] in which shift, turn and growth of the world move the points that are seen.
 
-    (The last is 0 and makes the count even.) Also the 7x7 matrix that makes them of the moves, and the points' mean.
+    (The last five are 0, for `_forward`.) Also the 7x7 matrix that makes them of the moves, and the points' mean.
     """
     joints = len(points)
-    moves, square, inverse, mean = np.zeros((8, 3 * joints)), np.empty((7, 7)), np.empty((7, 7)), np.zeros(3)
+    moves, square, inverse, mean = np.zeros((12, 3 * joints)), np.empty((7, 7)), np.empty((7, 7)), np.zeros(3)
     seen, count = np.zeros(joints), 0.0
     for j in joint:
         count += 1.0 - seen[j]
@@ -164,8 +170,9 @@ def _gauge(points: Any, joint: Any, trace: Any) -> Any:
 
 @compiled
 def _camera_covariance(
-    r: Any, t: Any, mean: Any, whitener: Any, z: Any, gauge: Any, inverse: Any, variance: Any, out: Any
-) -> None:
+    r: Any, t: Any, mean: Any, whitener: Any, z: Any, gauge: Any, shared: Any, inverse: Any, variance: Any,
+    out: Any,
+) -> None:  # fmt: skip
     """One camera's: W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T, see `uncertainty`."""
     size = gauge.shape[1]
     moved, outer, inner, half = np.zeros((6, 7)), np.zeros((6, 13)), np.zeros((13, 13)), np.empty((6, 13))
@@ -190,7 +197,7 @@ def _camera_covariance(
                 outer[p, 6 + q] += moved[p, k] * inverse[q, k]
     for p in range(7):
         for q in range(7):
-            inner[6 + p, 6 + q] = _dot(gauge[p], gauge[q], size)
+            inner[6 + p, 6 + q] = shared[p, q]
     for p in range(6):
         for q in range(13):
             half[p, q] = _dot(outer[p], inner[q], 13)
@@ -720,14 +727,23 @@ def _solve(matrix: Any, rhs: Any) -> Any:
 
 @compiled
 def _forward(factor: Any, rows: Any) -> None:
-    """Every row x of an even number becomes the solution y of ``factor`` y = x; entries past its size stay."""
-    for p in range(0, len(rows), 2):
-        x, y = rows[p], rows[p + 1]
+    """Every row x becomes the solution y of ``factor`` y = x; entries past its size stay. Rows in multiples of 6."""
+    for p in range(0, len(rows), 6):
+        x0, x1, x2, x3, x4, x5 = rows[p], rows[p + 1], rows[p + 2], rows[p + 3], rows[p + 4], rows[p + 5]
         for i in range(len(factor)):
-            row = factor[i]
-            s = t = 0.0
+            row, inverse = factor[i], 1.0 / factor[i, i]
+            s0 = s1 = s2 = s3 = s4 = s5 = 0.0
             for k in range(i):
-                s += row[k] * x[k]
-                t += row[k] * y[k]
-            x[i] = (x[i] - s) / row[i]
-            y[i] = (y[i] - t) / row[i]
+                f = row[k]
+                s0 += f * x0[k]
+                s1 += f * x1[k]
+                s2 += f * x2[k]
+                s3 += f * x3[k]
+                s4 += f * x4[k]
+                s5 += f * x5[k]
+            x0[i] = (x0[i] - s0) * inverse
+            x1[i] = (x1[i] - s1) * inverse
+            x2[i] = (x2[i] - s2) * inverse
+            x3[i] = (x3[i] - s3) * inverse
+            x4[i] = (x4[i] - s4) * inverse
+            x5[i] = (x5[i] - s5) * inverse
