@@ -1,6 +1,8 @@
 """Shared fixtures; jaxtyping annotations are checked at run time in every test."""
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import jaxtyping
@@ -31,6 +33,7 @@ with jaxtyping.install_import_hook(
         "kronc_ns.image_metrics",
         "kronc_ns.solved",
         "kronc_ns.report",
+        "kronc_ns.stages",
     ],
     "beartype.beartype",
 ):
@@ -100,6 +103,33 @@ def edit():
         path.write_text(json.dumps(content))
 
     return apply
+
+
+BROWSER_PATIENCE_MS = 180_000
+"""WebGL is drawn by the processor, which may be busy."""
+_CHROMIUM_FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Debian's chromium, driven by Playwright."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed: apt-get install chromium")
+    with sync_api.sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=chromium, args=_CHROMIUM_FLAGS)
+        yield running
+        running.close()
+
+
+@pytest.fixture(scope="session")
+def screenshots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where pictures of pages are left to be looked at: ``$KRONC_SCREENSHOTS``, else pytest's own folder."""
+    chosen = os.environ.get("KRONC_SCREENSHOTS")
+    folder = Path(chosen) if chosen else tmp_path_factory.mktemp("screenshots")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def scene_of(capture: Capture, given: torch.Tensor | None = None) -> Scene:

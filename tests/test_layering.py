@@ -12,6 +12,7 @@ LAYERS = [
     {"keypoints"},
     {"scene"},
     {"init", "objective", "solve"},
+    {"stages"},
     {"options", "frame", "orbit"},
     {"starts", "completion"},
     {"adjustment", "repair"},

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from jaxtyping import Bool, Float
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 from torch import Tensor
@@ -17,6 +16,7 @@ from kronc_ns.export import REPORT_FILE, is_report
 from kronc_ns.files import atomic_path
 from kronc_ns.report import figures
 from kronc_ns.report.overlays import choose_views, overlay
+from kronc_ns.report.templates import render, source
 from kronc_ns.scene import Scene
 from kronc_ns.solve.solution import Solution, Status, ViewStatus
 from kronc_ns.solved import read_record, read_solution
@@ -54,11 +54,8 @@ def _page(record: dict[str, Any], scene: Scene, solution: Solution, folder: Path
         "convergence": figures.convergence(solution),
         "uncertainties": figures.uncertainties(solution.views),
     }
-    environment = Environment(
-        loader=PackageLoader("kronc_ns.report", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
-    return environment.get_template("page.html").render(
+    return render(
+        "page.html",
         title=folder.resolve().name,
         record=record,
         solution=solution,
@@ -69,8 +66,8 @@ def _page(record: dict[str, Any], scene: Scene, solution: Solution, folder: Path
         without_image=sum(not shown.image for shown in overlays),
         plots={name: None if plot is None else _json(str(plot.to_json())) for name, plot in plots.items()},
         plotly=Markup(get_plotlyjs().replace("</script", r"<\/script")),
-        style=_source(environment, "page.css"),
-        script=_source(environment, "page.js"),
+        style=source("page.css") + source("overlay.css"),
+        script=source("page.js"),
     )
 
 
@@ -141,9 +138,3 @@ def _left_out(
 def _json(text: str) -> Markup:
     """JSON that may stand in a script element, whatever names are in it."""
     return Markup(text.replace("&", r"\u0026").replace("<", r"\u003c").replace(">", r"\u003e"))
-
-
-def _source(environment: Environment, name: str) -> Markup:
-    """A file of ours as it is."""
-    assert environment.loader is not None
-    return Markup(environment.loader.get_source(environment, name)[0])

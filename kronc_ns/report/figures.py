@@ -11,16 +11,12 @@ from jaxtyping import Bool, Float
 from plotly.subplots import make_subplots
 from torch import Tensor
 
-from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import transform
 from kronc_ns.scene import Scene
 from kronc_ns.solve.solution import Solution, ViewReport, ViewStatus
+from kronc_ns.stages import CROWDED, aligned_start, frustum_depth, known
 
-_FRUSTUM = 0.08
-"""Depth of a drawn camera as a share of the median distance of the cameras from their middle."""
-_CROWDED = 150
-"""From so many cameras on they are drawn smaller."""
 _OUTLINE = (1, 2, 3, 4, 1, 0, 2, 5, 3, 0, 4, 5)
 """A camera's eight edges as one line through centre (0) and corners (1 to 4), lifted twice (5)."""
 _BINS = 40
@@ -33,14 +29,13 @@ _MARKS = ((1, (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)), (2, (1.0, 2.0, 5.0)))
 def cameras_3d(scene: Scene, solution: Solution) -> go.Figure | None:
     """Cameras before (moved onto the solved ones by the best similarity) and after, and keypoints; None if none."""
     traces: list[go.Scatter3d] = []
-    after, before = solution.c2w, _aligned(solution.initial_c2w, solution.c2w)
-    depth = _frustum_depth(after if _known(after).any() else before)
-    known = _known(before)
-    if known.any():
+    after, before = solution.c2w, aligned_start(solution)
+    depth = frustum_depth(after if known(after).any() else before)
+    if known(before).any():
         start = f"before: {solution.init}"
-        traces.append(_outlines(before[known], solution.camera, depth, name=start, meta="before", width=1))
+        traces.append(_outlines(before[known(before)], solution.camera, depth, name=start, meta="before", width=1))
     for status in (ViewStatus.SOLVED, ViewStatus.COMPLETED):
-        chosen = _having(solution.views, status) & _known(after)
+        chosen = _having(solution.views, status) & known(after)
         if not chosen.any():
             continue
         traces.append(_outlines(after[chosen], solution.camera, depth, name=status.value, meta=status.value))
@@ -49,7 +44,7 @@ def cameras_3d(scene: Scene, solution: Solution) -> go.Figure | None:
             go.Scatter3d(
                 **_xyz(after[chosen][..., 3]),
                 mode="markers",
-                marker={"size": 2.5 if len(after) < _CROWDED else 1.5},
+                marker={"size": 2.5 if len(after) < CROWDED else 1.5},
                 meta=status.value,
                 text=labels,
                 hoverinfo="text",
@@ -174,28 +169,8 @@ def _logarithmic(values: Sequence[float]) -> dict:
     return {"type": "log", "tickvals": marks, "ticktext": [f"{mark:g}" for mark in marks]}
 
 
-def _known(c2w: Float[Tensor, "n 3 4"]) -> Bool[Tensor, "n"]:
-    return c2w.isfinite().all(-1).all(-1)
-
-
 def _having(views: Sequence[ViewReport], status: ViewStatus) -> Bool[Tensor, "n"]:
     return torch.tensor([view.status is status for view in views])
-
-
-def _aligned(initial: Float[Tensor, "n 3 4"], c2w: Float[Tensor, "n 3 4"]) -> Float[Tensor, "n 3 4"]:
-    """Initial poses, which have a frame of their own, moved onto the final ones where these tell how."""
-    both = _known(initial) & _known(c2w)
-    if int(both.sum()) < 3:
-        return initial
-    return umeyama(initial[both][..., 3], c2w[both][..., 3]).apply_to_poses(initial)
-
-
-def _frustum_depth(c2w: Float[Tensor, "n 3 4"]) -> float:
-    centres = c2w[_known(c2w)][..., 3]
-    if len(centres) < 2:
-        return 0.3
-    spread = float((centres - centres.mean(0)).norm(dim=-1).median())
-    return _FRUSTUM * spread * min(1.0, math.sqrt(_CROWDED / len(centres)))
 
 
 def _outlines(

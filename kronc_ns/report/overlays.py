@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import invert
+from kronc_ns.report.templates import render, source
 from kronc_ns.scene import Scene
 from kronc_ns.solve.solution import Solution, ViewStatus
 
@@ -102,6 +103,11 @@ def overlay(kind: str, i: int, scene: Scene, solution: Solution, inlier: Bool[Te
     )
 
 
+def overlay_svg(shown: Overlay) -> str:
+    """The overlay as an SVG file of its own."""
+    return render("overlay.svg", view=shown, own_style=source("overlay.css"))
+
+
 def _around(uv: Float[np.ndarray, "m 2"], camera: Camera) -> Box:
     """The smallest part of the image, of its proportions, that holds the pixels with a margin."""
     size = np.array([camera.width, camera.height])
@@ -130,15 +136,28 @@ def _projected(points: Float[Tensor, "j 3"], c2w: Float[Tensor, "3 4"], camera: 
     return pixels
 
 
-def _picture(path: Path, box: Box, camera: Camera) -> str:
+def load_image(path: Path, longer_side_px: int, part: tuple[float, ...] = (0, 0, 1, 1)) -> Image.Image | None:
+    """An image on white, no larger than asked; None where there is none that can be read.
+
+    ``part`` is what to cut out: left, top, right and bottom as shares of width and height.
+    """
     try:
         with Image.open(path) as file:
-            scale = (file.width / camera.width, file.height / camera.height) * 2
-            image = file.convert("RGBA").crop([round(x * s) for x, s in zip(box, scale, strict=True)])
+            if part == (0, 0, 1, 1):
+                file.thumbnail((longer_side_px, longer_side_px))  # lets JPEG skip most of its work
+            image = file.convert("RGBA")
     except (OSError, ValueError):
+        return None
+    image = image.crop([round(x * size) for x, size in zip(part, image.size * 2, strict=True)])
+    image.thumbnail((longer_side_px, longer_side_px))
+    return Image.alpha_composite(Image.new("RGBA", image.size, "white"), image).convert("RGB")
+
+
+def _picture(path: Path, box: Box, camera: Camera) -> str:
+    part = tuple(x / size for x, size in zip(box, (camera.width, camera.height) * 2, strict=True))
+    image = load_image(path, _LONGER_SIDE_PX, part)
+    if image is None:
         return ""
-    image.thumbnail((_LONGER_SIDE_PX, _LONGER_SIDE_PX))
-    white = Image.new("RGBA", image.size, "white")
     buffer = io.BytesIO()
-    Image.alpha_composite(white, image).convert("RGB").save(buffer, "JPEG", quality=_QUALITY)
+    image.save(buffer, "JPEG", quality=_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -1,0 +1,48 @@
+"""The cameras of a solution on their way from where they started to where they ended, in one frame."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from kronc_ns.geometry.alignment import umeyama
+from kronc_ns.geometry.poses import make_pose
+from kronc_ns.geometry.rotations import so3_exp, so3_log
+from kronc_ns.solve.solution import Solution
+
+_FRUSTUM = 0.08
+"""Depth of a drawn camera as a share of the median distance of the cameras from their middle."""
+CROWDED = 150
+"""From so many cameras on they are drawn smaller."""
+
+
+def known(c2w: Float[Tensor, "n 3 4"]) -> Bool[Tensor, "n"]:
+    """Which poses there are."""
+    return c2w.isfinite().all(-1).all(-1)
+
+
+def aligned_start(solution: Solution) -> Float[Tensor, "n 3 4"]:
+    """Initial poses, which have a frame of their own, moved onto the final ones where these tell how."""
+    initial, final = solution.initial_c2w, solution.c2w
+    both = known(initial) & known(final)
+    if int(both.sum()) < 3:
+        return initial
+    return umeyama(initial[both][..., 3], final[both][..., 3]).apply_to_poses(initial)
+
+
+def between(before: Float[Tensor, "n 3 4"], after: Float[Tensor, "n 3 4"], share: float) -> Float[Tensor, "n 3 4"]:
+    """Poses a ``share`` of the way: centres on a straight line, rotations about one axis. Unknown starts stay after."""
+    turn = so3_log(before[..., :3].transpose(-1, -2) @ after[..., :3])
+    rotation = before[..., :3] @ so3_exp(share * turn)
+    centre = torch.lerp(before[..., 3], after[..., 3], share)
+    return torch.where(known(before)[:, None, None], make_pose(rotation, centre), after)
+
+
+def frustum_depth(c2w: Float[Tensor, "n 3 4"]) -> float:
+    """Depth at which cameras are drawn, so that they are legible and do not overlap."""
+    centres = c2w[known(c2w)][..., 3]
+    if len(centres) < 2:
+        return 0.3
+    spread = float((centres - centres.mean(0)).norm(dim=-1).median())
+    return _FRUSTUM * spread * min(1.0, math.sqrt(CROWDED / len(centres)))
