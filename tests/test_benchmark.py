@@ -14,16 +14,17 @@ import pytest
 import torch
 
 from kronc_ns import cli
+from kronc_ns.benchmark import paper
 from kronc_ns.benchmark.baselines import bundle_adjustment, triangulate
 from kronc_ns.benchmark.commands import Commands
 from kronc_ns.benchmark.likelihood import maximum_likelihood
 from kronc_ns.benchmark.nvs_measures import Trainings, judge_exact, judge_solved
 from kronc_ns.benchmark.nvs_rows import METHODS, nvs_tasks
-from kronc_ns.benchmark.pose_rows import PAPER_NOISE, PAPER_VIEWS, pose_tasks
-from kronc_ns.benchmark.poses import capture_scene
+from kronc_ns.benchmark.pose_rows import pose_tasks
 from kronc_ns.benchmark.problems import REPORT_SEEDS, Options, best_poses, load_shapes, solution_figures
 from kronc_ns.benchmark.rows import Runs, Task, measure_row, measure_rows
 from kronc_ns.benchmark.speed_rows import speed_tasks
+from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.benchmark.table import rows_table
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.alignment import pose_errors
@@ -135,8 +136,8 @@ def test_a_failed_seed_counts_as_infinitely_bad_but_not_against_the_others():
 def test_every_row_of_the_issue_is_there():
     names = [task.name for task in pose_tasks(Options())]
     assert len(set(names)) == len(names)
-    assert sum("efficiency" in name for name in names) == len(PAPER_NOISE) == 6
-    assert sum("paper's table" in name for name in names) == len(PAPER_VIEWS) == 8
+    assert sum("efficiency" in name for name in names) == len(paper.BY_NOISE) == 6
+    assert sum("paper's table" in name for name in names) == len(paper.BY_VIEWS) == 8
     parts = ("no initial pose", "outliers", "focal", "swapped", "5 views", "<= 12 points", "20 % longer")
     for part in (*parts, "without keypoints", "95 %", "clockwise", "half", "reverse", "shuffled"):
         assert any(part in name for name in names), part

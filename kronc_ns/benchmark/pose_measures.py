@@ -7,9 +7,9 @@ import numpy as np
 import torch
 
 from kronc_ns.benchmark.baselines import bundle_adjustment
-from kronc_ns.benchmark.poses import capture_scene
 from kronc_ns.benchmark.problems import best_poses, noisy_start, raw_errors, solution_figures, solve_capture
 from kronc_ns.benchmark.rows import Figures, Runs
+from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.pipeline import KroncConfig, solve_scene

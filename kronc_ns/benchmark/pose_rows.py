@@ -5,36 +5,16 @@ from functools import partial
 
 import torch
 
+from kronc_ns.benchmark import paper
 from kronc_ns.benchmark import pose_measures as measures
 from kronc_ns.benchmark.problems import Options, capture_shape
 from kronc_ns.benchmark.rows import Task
 from kronc_ns.synthetic.scenes import Capture, Preset
 from kronc_ns.synthetic.variations import reverse, shuffle
 
-PAPER_NOISE = {
-    (4.0, 0.5): (0.65, 3.06),
-    (5.0, 0.7): (0.75, 3.07),
-    (5.0, 1.5): (1.35, 3.10),
-    (6.0, 2.0): (3.79, 3.16),
-    (6.0, 2.5): (2.34, 2.13),
-    (7.0, 3.0): (6.54, 6.21),
-}
-"""The paper's errors (degrees, centimetres) by noise of the start (degrees, metres), on CarPatch."""
-PAPER_VIEWS = {
-    5: (1.72, 3.37),
-    10: (0.73, 3.31),
-    20: (1.62, 3.24),
-    30: (2.24, 3.12),
-    40: (1.82, 3.10),
-    50: (1.18, 3.07),
-    60: (0.93, 3.06),
-    70: (0.69, 3.07),
-}
-"""The paper's errors (degrees, centimetres) by number of views, from (4 deg, 0.5 m)."""
-
 
 def pose_tasks(options: Options) -> list[Task]:
-    """All rows, in the order of the issue's table."""
+    """All rows, in the order of docs/results.md."""
     cars, lap = options.shapes, "1 px, 100 views, no initial pose"
     tasks = [
         Task(
@@ -43,9 +23,9 @@ def pose_tasks(options: Options) -> list[Task]:
             "hemisphere 400x400, 100 views, 1 px",
             20,
             lambda seed, start=start: measures.from_start(seed, start, adam=options.with_adam(seed)),
-            partial(measures.judge_efficiency, paper=PAPER_NOISE[start]),
+            partial(measures.judge_efficiency, paper=paper.BY_NOISE[start]),
         )
-        for start in PAPER_NOISE
+        for start in paper.BY_NOISE
     ]
     presets: tuple[tuple[Preset, str], ...] = (("walk", "walk 480x270"), ("carpatch", "hemisphere 400x400"))
     for preset, words in presets:
@@ -116,13 +96,13 @@ def pose_tasks(options: Options) -> list[Task]:
     tasks += [
         Task(
             f"paper's table, {views} views",
-            f"< {paper[0]} deg, < {paper[1]} cm: the paper's",
+            f"< {errors[0]} deg, < {errors[1]} cm: the paper's",
             "hemisphere 400x400, 1 px, from (4 deg, 0.5 m); means over seeds",
             20,
             partial(measures.from_start, start=measures.USUAL_START, views=views),
-            partial(measures.judge_views, paper=paper),
+            partial(measures.judge_views, paper=errors),
         )
-        for views, paper in PAPER_VIEWS.items()
+        for views, errors in paper.BY_VIEWS.items()
     ]
     tasks += [
         Task(

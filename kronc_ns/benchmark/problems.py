@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from kronc_ns.benchmark.baselines import bundle_adjustment
-from kronc_ns.benchmark.poses import capture_scene
+from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.geometry.rotations import rotation_angle_deg

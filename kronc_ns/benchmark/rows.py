@@ -96,7 +96,7 @@ class Row:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON, which has no infinities: they become null."""
-        return _plain(asdict(self))
+        return plain(asdict(self))
 
 
 def measure_row(task: Task, seeds: Sequence[int], progress: Callable[[int, int], None] | None = None) -> Row:
@@ -163,11 +163,12 @@ def hardware() -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Lists, dicts and numbers for JSON; what is not finite becomes None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

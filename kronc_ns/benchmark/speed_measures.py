@@ -13,9 +13,9 @@ import torch
 from kronc_ns.adjustment import shape_prior
 from kronc_ns.benchmark.baselines import LinearSolver, bundle_adjustment
 from kronc_ns.benchmark.pose_measures import USUAL_START, Verdict
-from kronc_ns.benchmark.poses import capture_scene
 from kronc_ns.benchmark.problems import Shapes, capture_shape, noisy_start, solution_figures
 from kronc_ns.benchmark.rows import Figures, Runs
+from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.pipeline import KroncConfig, solve_scene, solve_scenes

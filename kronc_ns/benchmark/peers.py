@@ -1,0 +1,155 @@
+"""Ways from a scene to its poses, side by side: ours, the paper's, bundle adjustment, and COLMAP's mappers."""
+
+import math
+import multiprocessing
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import assert_never
+
+from kronc_ns.benchmark.baselines import bundle_adjustment
+from kronc_ns.benchmark.colmap import map_images, map_keypoints
+from kronc_ns.benchmark.subjects import Subject
+from kronc_ns.errors import KroncError
+from kronc_ns.evaluate import AUC_LIMITS_DEG, evaluate_poses
+from kronc_ns.init import circular_poses
+from kronc_ns.pipeline import KroncConfig, solve_scene
+from kronc_ns.scene import Scene
+
+Method = Literal[
+    "kronc",
+    "adam",
+    "ceres",
+    "colmap incremental",
+    "colmap global",
+    "colmap incremental, masked",
+    "colmap global, masked",
+    "keypoints, colmap incremental",
+    "keypoints, colmap global",
+]
+"""kronc: the default solver; adam: the paper's; ceres: bundle adjustment of the same keypoints by pycolmap with a
+Cauchy loss; colmap: its mappers on SIFT features (all of them, or the masked vehicle's), or on the same keypoints."""
+
+START = (4.0, 0.5)
+"""The paper's noise of initial poses: degrees, metres."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What a method made of a scene."""
+
+    c2w: Float[Tensor, "n 3 4"]
+    """NaN where a view has no pose."""
+    seconds: float
+    """From keypoints or images to poses, initialisation included; of the second call where a method compiles itself."""
+    megabytes: float
+    """Peak memory above what the process had before; NaN where the system does not tell."""
+
+
+def place(
+    method: Method, subject: Subject, start: Float[Tensor, "n 3 4"] | None = None, config: KroncConfig | None = None
+) -> Placed:
+    """Poses of a subject, computed in a process of its own. Methods that need poses to start from get ``start``.
+
+    Without it kronc finds its own and the others that need one begin on the paper's circle. ``config`` replaces the
+    settings of kronc and adam.
+    """
+    scene = replace(subject.scene, given_c2w=start)
+    run = partial(_poses, method, scene, subject.folder, config)
+    # spawned: forks of a process whose threads hold locks may never begin
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(_measured, run, method == "kronc").result()
+        except BrokenProcessPool:
+            raise KroncError(f"{method} on {subject.name} ended its process: is there memory enough?") from None
+
+
+def figures(placed: Placed, subject: Subject) -> dict[str, float]:
+    """Errors against the truth after a similarity alignment, the share of views with a pose, time and memory.
+
+    Fewer than three views with a pose have no errors (NaN) and a recall of 0.
+    """
+    names = subject.scene.names
+    ok = placed.c2w.isfinite().all(-1).all(-1).tolist()
+    found = {
+        "registered": sum(ok) / len(ok),
+        "seconds": placed.seconds,
+        "megabytes": placed.megabytes,
+    }
+    if sum(ok) < 3:
+        missing = ("rotation_deg", "median_deg", "worst_deg", "centre_cm", "median_cm", "worst_cm")
+        return {**dict.fromkeys(missing, math.nan), **{f"auc_{x}": 0.0 for x in AUC_LIMITS_DEG}, **found}
+    errors = evaluate_poses(
+        {name: pose for name, pose, here in zip(names, placed.c2w, ok, strict=True) if here},
+        dict(zip(names, subject.truth, strict=True)),
+    ).as_dict()
+    rotation, centre = errors["rotation_deg"], errors["translation"]
+    return {
+        "rotation_deg": rotation["mean"],
+        "median_deg": rotation["median"],
+        "worst_deg": rotation["max"],
+        "centre_cm": 100 * centre["mean"],
+        "median_cm": 100 * centre["median"],
+        "worst_cm": 100 * centre["max"],
+        **{f"auc_{x}": errors[f"auc_{x}deg"] for x in AUC_LIMITS_DEG},
+        **found,
+    }
+
+
+def _measured(run: Callable[[], Tensor], again: bool) -> Placed:
+    """In the other process: poses, time and memory."""
+    if again:
+        run()
+    base = _forget_peak()
+    begin = time.perf_counter()
+    c2w = run()
+    return Placed(c2w, time.perf_counter() - begin, _memory("VmHWM") - base)
+
+
+def _forget_peak() -> float:
+    """Let the peak of this process begin anew at what it has now, in megabytes (Linux; elsewhere NaN)."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return math.nan
+    return _memory("VmRSS")
+
+
+def _memory(field: str) -> float:
+    """A field of /proc/self/status in megabytes; NaN where there is none."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return math.nan
+    return next((float(line.split()[1]) / 1024 for line in lines if line.startswith(field)), math.nan)
+
+
+def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfig | None) -> Float[Tensor, "n 3 4"]:
+    match method:
+        case "kronc" | "adam":
+            solver: Literal["lm", "adam"] = "lm" if method == "kronc" else "adam"
+            config = config or KroncConfig()
+            solution = solve_scene(scene, replace(config, solver=solver, min_status="solved"))
+            return solution.c2w
+        case "ceres":
+            start = scene.given_c2w
+            start = circular_poses(len(scene), KroncConfig().radius_m, "ccw", 1.0) if start is None else start
+            return bundle_adjustment(scene, start, loss="cauchy").c2w
+        case "colmap incremental" | "colmap global" | "colmap incremental, masked" | "colmap global, masked":
+            if folder is None:
+                raise KroncError(f"{method} needs images: give scene folders with --captures")
+            return map_images(scene, folder, "global" if "global" in method else "incremental", "masked" in method)
+        case "keypoints, colmap incremental":
+            return map_keypoints(scene, "incremental")
+        case "keypoints, colmap global":
+            return map_keypoints(scene, "global")
+        case _:
+            assert_never(method)

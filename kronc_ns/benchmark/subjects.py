@@ -1,0 +1,90 @@
+"""Captures whose true poses are known, and what is done to them before they are solved."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from kronc_ns.errors import KroncError
+from kronc_ns.geometry.camera import rays
+from kronc_ns.init import triangulate
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66
+from kronc_ns.scene import Scene, load_scene, read_poses
+from kronc_ns.synthetic.scenes import Capture, Preset, make_capture
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A capture and the truth about it."""
+
+    name: str
+    scene: Scene
+    truth: Float[Tensor, "n 3 4"]
+    folder: Path | None = None
+    """Where its images are; None where it was never rendered."""
+
+    @property
+    def points(self) -> Float[Tensor, "j 3"]:
+        """Keypoints where true poses and detections see them."""
+        return triangulate(self.truth, rays(self.scene.uv, self.scene.camera), self.scene.visibility)
+
+
+def capture_scene(capture: Capture, given: Float[Tensor, "n 3 4"] | None = None) -> Scene:
+    """A synthetic capture as a scene in memory."""
+    names = tuple(f"images/frame_{i + 1:05d}.png" for i in range(len(capture.c2w)))
+    return Scene(names, capture.camera, APOLLOCAR3D_66, capture.keypoints, given)
+
+
+def procedural(seed: int, preset: Preset = "carpatch", views: int = 100) -> Subject:
+    """A random car with exact keypoints."""
+    capture = make_capture(preset, views, seed)
+    return Subject(f"procedural car {seed}", capture_scene(capture), capture.c2w)
+
+
+def from_folder(folder: Path) -> Subject:
+    """A scene folder with its reference.json; views without a reference are left out."""
+    if not (folder / "reference.json").is_file():
+        raise KroncError(f"{folder}: expected a scene folder with the true poses in reference.json")
+    scene, reference = load_scene(folder), read_poses(folder / "reference.json")
+    known = torch.tensor([name in reference for name in scene.names])
+    scene = chosen_views(scene, known)
+    if len(scene) < 3:
+        raise KroncError(f"{folder}: {len(scene)} views of keypoints.json are in reference.json, expected at least 3")
+    truth = torch.stack([reference[name] for name in scene.names])
+    return Subject(folder.resolve().name, replace(scene, given_c2w=None), truth, folder)
+
+
+def with_noise(subject: Subject, noise_px: float, seed: int) -> Subject:
+    """Detections with normal noise, ``noise_px`` of standard deviation along each axis."""
+    generator = torch.Generator().manual_seed(seed)
+    keypoints = subject.scene.keypoints.clone()
+    noise = torch.randn(keypoints[..., :2].shape, generator=generator, dtype=keypoints.dtype)
+    keypoints[..., :2] += noise_px * noise * (keypoints[..., 2:] > 0)
+    return replace(subject, scene=replace(subject.scene, keypoints=keypoints))
+
+
+def thinned(subject: Subject, views: int) -> Subject:
+    """So many of the views, evenly spread over the capture."""
+    if not 3 <= views <= len(subject.truth):
+        raise KroncError(f"{views} views of {subject.name}: expected 3 to {len(subject.truth)}")
+    keep = torch.zeros(len(subject.truth), dtype=torch.bool)
+    keep[torch.linspace(0, len(keep) - 1, views).round().long()] = True
+    return replace(subject, scene=chosen_views(subject.scene, keep), truth=subject.truth[keep])
+
+
+def chosen_views(scene: Scene, keep: Bool[Tensor, "n"]) -> Scene:
+    """The scene of the views in ``keep``."""
+
+    def names(of: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(name for name, kept in zip(of, keep.tolist(), strict=True) if kept)
+
+    return replace(
+        scene,
+        names=names(scene.names),
+        keypoints=scene.keypoints[keep],
+        given_c2w=None if scene.given_c2w is None else scene.given_c2w[keep],
+        given_depths=None if scene.given_depths is None else scene.given_depths[keep],
+        masks=None if scene.masks is None else names(scene.masks),
+    )

@@ -1,0 +1,162 @@
+"""A table: one row a setting, means over all subjects; written as Markdown for readers and as JSON with every run."""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from kronc_ns.benchmark.peers import START, Method, figures, place
+from kronc_ns.benchmark.rows import hardware, plain
+from kronc_ns.benchmark.subjects import Subject, from_folder, procedural, thinned, with_noise
+from kronc_ns.console import progress_bar
+from kronc_ns.errors import KroncError
+from kronc_ns.files import atomic_path, write_json
+from kronc_ns.init import noisy_poses
+from kronc_ns.options import KroncConfig
+
+
+@dataclass(kw_only=True)
+class TableOptions:
+    """On what a table is measured."""
+
+    output_dir: Path
+    """Folder for the table, as NAME.md and NAME.json."""
+    captures: tuple[Path, ...] = ()
+    """Scene folders with true poses in reference.json; default: procedural cars with keypoints alone."""
+    cars: int = 5
+    """Number of procedural cars."""
+    noise_px: tuple[float, ...] = (0.0, 1.0)
+    """Noise of the keypoints: standard deviation along each axis, in pixels of the capture. What comes with a folder
+    as measured keypoints is taken as it is with 0."""
+    first_seed: int = 0
+    """Seed of the first subject's noise and, of procedural cars, shape."""
+
+    def subjects(self) -> list[Subject]:
+        """Captures, or cars."""
+        if self.captures:
+            return [from_folder(folder) for folder in self.captures]
+        if self.cars < 1:
+            raise KroncError(f"--cars {self.cars}: expected 1 or more")
+        return [procedural(self.first_seed + i) for i in range(self.cars)]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One row: a method, and what it is given."""
+
+    labels: Mapping[str, str]
+    """The first columns."""
+    method: Method
+    noise_px: float
+    start: tuple[float, float] | None = START
+    """Noise of the poses to start from (degrees, metres); None: no poses are given."""
+    config: KroncConfig | None = None
+    """Settings of kronc and adam other than their defaults."""
+    views: Callable[[int], int] = int
+    """How many of a capture's views take part."""
+    depth_noise: float | None = None
+    """Relative noise of the depths that are given, for each view and for each keypoint; None: none are given."""
+    paper: Mapping[str, str] = field(default_factory=dict)
+    """The last columns: what the paper has here."""
+
+
+def make_table(
+    name: str, title: str, options: TableOptions, settings: Callable[[TableOptions], Sequence[Setting]]
+) -> None:
+    """Measure all settings on all subjects; print the table and write it."""
+    begin = time.perf_counter()
+    machine, subjects, chosen = hardware(), options.subjects(), settings(options)
+    rows: list[dict[str, Any]] = []
+    with progress_bar(name) as progress:
+        for done, setting in enumerate(chosen):
+            progress(done, len(chosen), None)
+            runs = [_run(setting, subject, options.first_seed + i) for i, subject in enumerate(subjects)]
+            names = [subject.name for subject in subjects]
+            rows.append(
+                {
+                    "labels": dict(setting.labels),
+                    **_means(runs),
+                    "paper": dict(setting.paper),
+                    "runs": dict(zip(names, runs, strict=True)),
+                }
+            )
+    seconds = time.perf_counter() - begin
+    about = (
+        f"{len(subjects)} captures ({', '.join(subject.name for subject in subjects)}), seeds from "
+        f"{options.first_seed} on; {machine['cores']} cores ({machine['cpu']}), load {machine['load_1min'] or 0:.1f}, "
+        f"GPU {machine['gpu'] or 'none'}; {seconds:.0f} s in all. Errors: means over the captures of each one's mean / "
+        "median / worst view; seconds and megabytes are those of one capture."
+    )
+    text = f"## {title}\n\n{markdown(rows)}\n\n{about}\n"
+    with atomic_path(options.output_dir / f"{name}.md") as path:
+        path.write_text(text, encoding="utf-8")
+    content = {"table": name, "title": title, "hardware": machine, "seconds": seconds, "rows": rows}
+    write_json(options.output_dir / f"{name}.json", plain(content))
+    Console(soft_wrap=True).print(text, markup=False, highlight=False)
+
+
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The table as Markdown; a dash where there is no figure."""
+    papers = list(dict.fromkeys(name for row in rows for name in row["paper"]))
+    head = [
+        *rows[0]["labels"],
+        "views placed",
+        "rotation (deg)",
+        "centre (cm)",
+        "AUC 3 / 5 / 30 deg",
+        "s",
+        "MB",
+        *papers,
+    ]
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        three = [
+            " / ".join(_number(row[key]) for key in keys)
+            for keys in (
+                ("rotation_deg", "median_deg", "worst_deg"),
+                ("centre_cm", "median_cm", "worst_cm"),
+                ("auc_3", "auc_5", "auc_30"),
+            )
+        ]
+        placed = f"{100 * row['registered']:.0f} %"
+        cost = [_number(row["seconds"]), _number(row["megabytes"])]
+        lines.append([*row["labels"].values(), placed, *three, *cost, *(row["paper"].get(x, "-") for x in papers)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _run(setting: Setting, subject: Subject, seed: int) -> dict[str, float]:
+    subject = with_noise(thinned(subject, setting.views(len(subject.truth))), setting.noise_px, seed)
+    generator = torch.Generator().manual_seed(seed)
+    start = None
+    if setting.start is not None:
+        start = noisy_poses(subject.truth, *setting.start, generator)
+    if setting.depth_noise is not None:
+        arm = subject.points - subject.truth[:, None, :, 3]
+        depths = (arm * subject.truth[:, None, :, 2]).sum(-1)
+        noise = torch.randn(len(depths), 1 + depths.shape[1], generator=generator, dtype=depths.dtype)
+        depths = depths * (setting.depth_noise * (noise[:, :1] + noise[:, 1:])).exp()
+        subject = replace(subject, scene=replace(subject.scene, given_depths=depths))
+    try:
+        return figures(place(setting.method, subject, start, setting.config), subject)
+    except KroncError as error:
+        raise KroncError(f"{', '.join(setting.labels.values())} on {subject.name}: {error}") from None
+
+
+def _means(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Means over the runs; of the errors over those that placed views enough to have any."""
+    means = {}
+    for name in runs[0]:
+        values = [run[name] for run in runs if math.isfinite(run[name])]
+        means[name] = sum(values) / len(values) if values else math.nan
+    return means
+
+
+def _number(value: float) -> str:
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.2g}" if 0 < abs(value) < 0.01 else f"{value:.2f}" if value < 100 else f"{value:.0f}"

@@ -1,0 +1,10 @@
+#!/usr/bin/env python
+"""The paper's ablation of initial depths; the prior is the truth with noise in place of a network's depths."""
+
+import tyro
+
+from kronc_ns.benchmark.settings import by_depths
+from kronc_ns.benchmark.tables import TableOptions, make_table
+
+if __name__ == "__main__":
+    make_table("depths", "By where the depths begin", tyro.cli(TableOptions, description=__doc__), by_depths)

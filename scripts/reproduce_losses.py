@@ -1,0 +1,10 @@
+#!/usr/bin/env python
+"""The paper's ablation of its 2D and 3D losses."""
+
+import tyro
+
+from kronc_ns.benchmark.settings import by_loss
+from kronc_ns.benchmark.tables import TableOptions, make_table
+
+if __name__ == "__main__":
+    make_table("losses", "By the losses that Adam minimises", tyro.cli(TableOptions, description=__doc__), by_loss)

@@ -1,0 +1,10 @@
+#!/usr/bin/env python
+"""The paper's ablation of initial noise."""
+
+import tyro
+
+from kronc_ns.benchmark.settings import by_noise
+from kronc_ns.benchmark.tables import TableOptions, make_table
+
+if __name__ == "__main__":
+    make_table("noise", "By the noise of the initial poses", tyro.cli(TableOptions, description=__doc__), by_noise)

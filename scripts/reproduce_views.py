@@ -1,0 +1,10 @@
+#!/usr/bin/env python
+"""The paper's table by number of poses."""
+
+import tyro
+
+from kronc_ns.benchmark.settings import by_views
+from kronc_ns.benchmark.tables import TableOptions, make_table
+
+if __name__ == "__main__":
+    make_table("views", "By the number of views", tyro.cli(TableOptions, description=__doc__), by_views)
