@@ -132,12 +132,7 @@ def test_markdown_has_a_dash_for_what_is_not_there():
     papers = {"a": {}, "b": {"paper": "1 deg"}}
     row = dict.fromkeys(("rotation_deg", "median_deg", "worst_deg", "centre_cm", "median_cm", "worst_cm"), math.nan)
     row |= {"auc_3": 0.0, "auc_5": 0.0, "auc_30": 0.0, "registered": 0.0, "seconds": 1.5, "megabytes": math.nan}
-    lines = markdown(
-        [
-            {"labels": {"method": "a"}, **row, "paper": {}},
-            {"labels": {"method": "b"}, **row, "paper": {"paper": "1 deg"}},
-        ]
-    )
+    lines = markdown([{"labels": {"method": name}, **row, "paper": paper} for name, paper in papers.items()])
     head, rule, first, second = lines.splitlines()
     assert head.count("|") == rule.count("|") == first.count("|") == second.count("|")
     assert first == "| a | 0 % | - / - / - | - / - / - | 0.00 / 0.00 / 0.00 | 1.50 | - | - |"
