@@ -40,22 +40,52 @@ def write_variant(
     """
     found = keypoints or data / "keypoints.json"
     scene = load_scene(data, found)
-    reference = read_poses(data / "reference.json")
-    truth = torch.stack([reference[name] for name in scene.names])
-    claim_output(folder)
     if which == "solved":
-        solution = solve_scene(scene, config)
-    else:
-        c2w = truth
-        if which == "given":
-            assert scene.given_c2w is not None
-            c2w = scene.given_c2w
-        elif which == "circle":
-            circle = circular_poses(len(scene), config.radius_m, config.direction, config.laps)
-            c2w = umeyama(circle[..., 3], truth[..., 3]).apply_to_poses(circle)
-        solution = _as_solution(scene.names, scene, c2w, points)
-    write_solution(folder, scene, solution, data, inputs=which)
-    (folder / "keypoints.json").write_bytes(found.read_bytes())
+        claim_output(folder)
+        write_solution(folder, scene, solve_scene(scene, config), data, inputs=which)
+        return
+    reference = read_poses(data / "reference.json")
+    c2w = truth = torch.stack([reference[name] for name in scene.names])
+    if which == "given":
+        assert scene.given_c2w is not None
+        c2w = scene.given_c2w
+    elif which == "circle":
+        circle = circular_poses(len(scene), config.radius_m, config.direction, config.laps)
+        c2w = umeyama(circle[..., 3], truth[..., 3]).apply_to_poses(circle)
+    write_poses(folder, data, scene, c2w, points)
+
+
+def write_poses(
+    folder: Path, data: Path, scene: Scene, c2w: Float[Tensor, "n 3 4"], points: Float[Tensor, "j 3"]
+) -> None:
+    """A data set of the capture ``data`` with poses that came from elsewhere; NaN where a view has none.
+
+    ``points`` are the keypoints in the world of the poses: they say where the car is.
+    """
+    claim_output(folder)
+    posed = c2w.isfinite().all(-1).all(-1).tolist()
+    views = tuple(
+        ViewReport(name, ViewStatus.SOLVED if ok else ViewStatus.FAILED, 0, 0, None)
+        for name, ok in zip(scene.names, posed, strict=True)
+    )
+    solution = Solution(
+        status=Status.CONVERGED,
+        reason="poses that were not solved, for comparison",
+        names=scene.names,
+        camera=scene.camera,
+        c2w=c2w,
+        points=points,
+        depths=torch.full(scene.visibility.shape, float("nan"), dtype=torch.float64),
+        views=views,
+        initial_c2w=c2w,
+        solver="none",
+        init="given",
+        iterations=0,
+        seconds=0.0,
+        rmse_px=float("nan"),
+        median_px=float("nan"),
+    )
+    write_solution(folder, scene, solution, data, inputs="poses from elsewhere")
 
 
 def add_half_size(data: Path) -> None:
@@ -93,25 +123,3 @@ def evaluate(config: Path, renders: Path | None = None) -> dict[str, Any]:
 def run(command: str, *arguments: str) -> str:
     """Run one of nerfstudio's commands of this environment; its output, or an error that ends with it."""
     return Commands().run(command, *arguments)
-
-
-def _as_solution(names: tuple[str, ...], scene: Scene, c2w: Tensor, points: Tensor) -> Solution:
-    views = tuple(ViewReport(name, ViewStatus.SOLVED, 0, 0, None) for name in names)
-    depths = torch.full(scene.visibility.shape, float("nan"), dtype=torch.float64)
-    return Solution(
-        status=Status.CONVERGED,
-        reason="poses that were not solved, for comparison",
-        names=names,
-        camera=scene.camera,
-        c2w=c2w,
-        points=points,
-        depths=depths,
-        views=views,
-        initial_c2w=c2w,
-        solver="none",
-        init="given",
-        iterations=0,
-        seconds=0.0,
-        rmse_px=float("nan"),
-        median_px=float("nan"),
-    )

@@ -1,0 +1,123 @@
+"""Fields trained on the poses of several methods, on the full frame and on the vehicle cut out."""
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxtyping import Float
+from rich.console import Console
+from torch import Tensor
+
+from kronc_ns.benchmark.commands import Commands
+from kronc_ns.benchmark.peers import Method, Placed, figures, place
+from kronc_ns.benchmark.rows import hardware, plain
+from kronc_ns.benchmark.subjects import Subject, from_folder
+from kronc_ns.benchmark.training import train, write_poses
+from kronc_ns.errors import KroncError
+from kronc_ns.files import atomic_path, write_json
+from kronc_ns.geometry.alignment import umeyama
+from kronc_ns.init import circular_poses
+from kronc_ns.options import KroncConfig
+from kronc_ns.solve.adam import AdamConfig
+
+PosesOf = Method | Literal["reference", "circle"]
+_PAPER = {
+    "reference": "29.20 (29.31), COLMAP's poses",
+    "colmap incremental": "29.20 (29.31)",
+    "adam": "19.41 (21.89)",
+    "circle": "12.0 on its easiest scene",
+}
+"""PSNR, full frame (vehicle), means over the seven real scenes of the paper."""
+
+
+@dataclass(kw_only=True)
+class FieldOptions:
+    """What is trained, and on which poses."""
+
+    output_dir: Path
+    """New or empty folder for the table (fields.md, fields.json), the data sets and the runs."""
+    captures: tuple[Path, ...]
+    """Scene folders with images, masks and poses to compare with in reference.json."""
+    poses: tuple[PosesOf, ...] = ("reference", "kronc", "adam", "colmap incremental", "circle")
+    """Whose poses; all but the reference's are found without a start (Adam begins on the circle)."""
+    method: str = "kronc-splatfacto-cpu"
+    """Method of `ns-train`."""
+    backgrounds: tuple[Literal["keep", "white"], ...] = ("keep", "white")
+    """keep: trained and tested on the full frame; white: on the vehicle, cut out."""
+    radius_m: float = 4.0
+    """Radius of the circle."""
+    iterations: int | None = None
+    """Training steps (default: the method's)."""
+
+
+def make_field_table(options: FieldOptions) -> None:
+    """Train and test on all of them; print the table and write it."""
+    if options.output_dir.exists() and any(options.output_dir.iterdir()):
+        raise KroncError(f"{options.output_dir} is in use: expected a new or empty folder")
+    begin, machine = time.perf_counter(), hardware()
+    rows = []
+    with Commands({"KRONC_NS_CACHE": str(options.output_dir.resolve() / "cache")}) as commands:
+        for folder in options.captures:
+            subject = from_folder(folder)
+            for poses in options.poses:
+                rows.append(_row(subject, poses, options, commands))
+                print(" | ".join(rows[-1]["cells"]), file=sys.stderr)
+    seconds = time.perf_counter() - begin
+    head = ["capture", "poses", "views placed", "rotation, centre (median)", *options.backgrounds, "paper"]
+    lines = [head, ["---"] * len(head), *([*row["cells"], _PAPER.get(row["poses"], "-")] for row in rows)]
+    text = (
+        "## Fields on the poses of several methods\n\n"
+        + "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        + "\n\nPSNR (dB) / SSIM of the full frame (of the vehicle) over the test views; keep: trained on the full "
+        f"frame, white: on the vehicle cut out. `{options.method}`, every 8th view for testing, {machine['cores']} "
+        f"cores ({machine['cpu']}), load {machine['load_1min'] or 0:.1f}; {seconds:.0f} s in all.\n"
+    )
+    with atomic_path(options.output_dir / "fields.md") as path:
+        path.write_text(text, encoding="utf-8")
+    write_json(options.output_dir / "fields.json", plain({"hardware": machine, "seconds": seconds, "rows": rows}))
+    Console(soft_wrap=True).print(text, markup=False, highlight=False)
+
+
+def _row(subject: Subject, poses: PosesOf, options: FieldOptions, commands: Commands) -> dict[str, Any]:
+    c2w, errors = _poses(subject, poses, options)
+    data = options.output_dir / subject.name / poses.replace(",", "").replace(" ", "_")
+    assert subject.folder is not None
+    write_poses(data, subject.folder, subject.scene, c2w, subject.points)
+    results: dict[str, Any] = {}
+    steps = [] if options.iterations is None else ["--max-num-iterations", str(options.iterations)]
+    for background in options.backgrounds:
+        parser = ["--background", background]
+        config = train(data, options.method, data / "runs" / background, steps, parser, commands)
+        pictures = data / "pictures" / background
+        output = commands.run("kronc", "eval", "--nvs", str(config), "--pictures", str(pictures), "--json")
+        results[background] = {name: json.loads(output)[name] for name in ("full", "masked")}
+    placed = f"{100 * errors['registered']:.0f} %"
+    apart = f"{errors['median_deg']:.2f} deg, {errors['median_cm']:.1f} cm"
+    cells = [subject.name, poses, placed, apart, *(_psnr(results[name]) for name in options.backgrounds)]
+    return {"capture": subject.name, "poses": poses, "errors": errors, "results": results, "cells": cells}
+
+
+def _poses(subject: Subject, poses: PosesOf, options: FieldOptions) -> tuple[Float[Tensor, "n 3 4"], dict[str, float]]:
+    """Poses in the frame of the reference, and their errors."""
+    if poses == "reference":
+        c2w = subject.truth
+    elif poses == "circle":
+        c2w = circular_poses(len(subject.truth), options.radius_m, "ccw", 1.0)
+    else:
+        real = KroncConfig(init="circular", radius_m=options.radius_m, adam=AdamConfig(learning_rate=0.001))
+        c2w = place(poses, subject, None, real if poses == "adam" else None).c2w
+    posed = c2w.isfinite().all(-1).all(-1)
+    if int(posed.sum()) < 3:
+        raise KroncError(f"{poses} places {int(posed.sum())} views of {subject.name}: nothing to train on")
+    c2w = umeyama(c2w[posed][..., 3], subject.truth[posed][..., 3]).apply_to_poses(c2w)
+    return c2w, figures(Placed(c2w, 0.0, 0.0), subject)
+
+
+def _psnr(results: dict[str, Any]) -> str:
+    def cell(metrics: dict[str, Any] | None) -> str:
+        return "-" if metrics is None else f"{metrics['psnr']:.2f} / {metrics['ssim']:.3f}"
+
+    return f"{cell(results['full'])} ({cell(results['masked'])})"
