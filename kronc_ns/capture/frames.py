@@ -5,21 +5,19 @@ import json
 import os
 import re
 import shutil
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 
-from kronc_ns.capture.images import (
-    copy_upright,
-    downscale_factors,
-    level_path,
-    load_image,
-    upright_size,
-    write_downscales,
-)
+from PIL import Image
+
+from kronc_ns.capture.images import copy_upright, downscale_factors, level_path, upright_size, write_downscales
+from kronc_ns.capture.selection import Sampling
 from kronc_ns.capture.source import IMAGE_SUFFIXES, MIN_FRAMES, Count, Source
-from kronc_ns.capture.video import extract_frames, probe_video
+from kronc_ns.capture.video import VideoFrames, probe_video
 from kronc_ns.errors import KroncError
 from kronc_ns.files import write_json
 from kronc_ns.keypoints.io import read_json
@@ -27,6 +25,8 @@ from kronc_ns.keypoints.io import read_json
 RECORD = ".kronc-frames.json"
 """Says which source the frames of an output folder are from, so that a second run need not make them again."""
 _OURS = re.compile(r"frame_\d{5,}\.(npy|" + "|".join(suffix[1:] for suffix in IMAGE_SUFFIXES) + ")", re.IGNORECASE)
+VIDEO_FRAME = "images/frame_{:05d}.png"
+_PNG_LEVEL = 3  # half the time of zlib's default for a few per cent more bytes
 _FOLDERS = re.compile(r"(images|masks|depths)(_\d+)?")
 
 
@@ -44,6 +44,8 @@ class Frames:
     """Downscaled copies there are."""
     reused: bool
     """They were there already, made from the same source by an earlier run."""
+    note: str = ""
+    """What of a video was left out and why."""
 
 
 def check_source(source: Source) -> tuple[int, int] | None:
@@ -72,16 +74,15 @@ def check_source(source: Source) -> tuple[int, int] | None:
     return first
 
 
-def find_frames(
-    source: Source, out: Path, fps: float = 5.0, num_frames_target: int | None = None, num_downscales: int = 3
-) -> Frames | None:
+def find_frames(source: Source, out: Path, sampling: Sampling | None = None, num_downscales: int = 3) -> Frames | None:
     """The frames that an earlier `prepare_frames` with the same arguments left in ``out``, if they are all there."""
     try:
         content = read_json(out / RECORD)
         width, height = content["size"]
         names, factors = tuple(content["names"]), tuple(content["factors"])
-        frames = Frames(names, tuple(content["source_names"]), (width, height), factors, reused=True)
-        same = content["source"] == _signature(source, fps, num_frames_target, num_downscales)
+        note, source_names = str(content["note"]), tuple(content["source_names"])
+        frames = Frames(names, source_names, (width, height), factors, reused=True, note=note)
+        same = content["source"] == _signature(source, sampling or Sampling(), num_downscales)
     except (KroncError, KeyError, TypeError, ValueError):
         return None
     paths = [level_path(out / name, factor) for name in names for factor in (1, *factors)]
@@ -91,8 +92,7 @@ def find_frames(
 def prepare_frames(
     source: Source,
     out: Path,
-    fps: float = 5.0,
-    num_frames_target: int | None = None,
+    sampling: Sampling | None = None,
     num_downscales: int = 3,
     keep: Sequence[Path] = (),
     progress: Count | None = None,
@@ -102,30 +102,31 @@ def prepare_frames(
     Photos are turned upright as their EXIF says; images of a scene folder are copied as they are stored, since
     its transforms.json speaks of those pixels. Frames of an earlier run are removed first, but nothing in ``keep``.
     """
-    signature = _signature(source, fps, num_frames_target, num_downscales)
+    signature = _signature(source, sampling or Sampling(), num_downscales)
     (out / RECORD).unlink(missing_ok=True)
     _clear(out, keep)
     (out / "images").mkdir(exist_ok=True)
     count = progress or (lambda *_: None)
     if source.kind == "video":
-        images = extract_frames(source.path, out / "images", fps, num_frames_target, count)
-        names = tuple(f"images/{image.name}" for image in images)
-        source_names = names
+        video = VideoFrames(source.path, sampling or Sampling(), count)
+        total = _for_each(partial(_write, out, num_downscales), enumerate(video, start=1))
+        names = tuple(VIDEO_FRAME.format(number) for number in range(1, total + 1))
+        source_names, note = names, video.note()
     else:
-        images = source.images
-        names, source_names = frame_names(images), source.names
-    factors = downscale_factors(upright_size(images[0], source.camera is None), num_downscales)
+        names, source_names, note = frame_names(source.images), source.names, ""
+        orient = source.camera is None
 
-    def write(image: Path, name: str) -> None:
-        target = out / name
-        whole = load_image(image) if source.kind == "video" else copy_upright(image, target, source.camera is None)
-        write_downscales(whole, target, factors)
+        def copy(image: Path, name: str) -> None:
+            whole = copy_upright(image, out / name, orient)
+            write_downscales(whole, out / name, downscale_factors(whole.size, num_downscales))
 
-    _for_each(write, list(zip(images, names, strict=True)), count)
+        pairs = list(zip(source.images, names, strict=True))
+        _for_each(copy, pairs, lambda done: count(done, len(pairs), None))
     size = upright_size(out / names[0], orient=False)
+    factors = downscale_factors(size, num_downscales)
     content = {"source": signature, "size": size, "factors": factors, "names": names, "source_names": source_names}
-    write_json(out / RECORD, content)
-    return Frames(names, source_names, size, factors, reused=False)
+    write_json(out / RECORD, {**content, "note": note})
+    return Frames(names, source_names, size, factors, reused=False, note=note)
 
 
 def frame_names(images: Sequence[Path]) -> tuple[str, ...]:
@@ -170,23 +171,48 @@ def copy_reference(source: Source, frames: Frames, out: Path) -> None:
     write_json(out / "reference.json", {**without_files, "frames": known})
 
 
-def _for_each(work: Callable[..., None], items: list[tuple], count: Count) -> None:
-    """Do ``work`` on all items with a few threads (decoding and scaling release the GIL); the first error ends it."""
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        futures = [pool.submit(work, *item) for item in items]
+def _write(out: Path, num_downscales: int, number: int, frame: Image.Image) -> None:
+    """Write a frame of a video with its downscaled copies."""
+    target = out / VIDEO_FRAME.format(number)
+    frame.save(target, compress_level=_PNG_LEVEL)
+    write_downscales(frame, target, downscale_factors(frame.size, num_downscales))
+
+
+def _for_each(work: Callable[..., None], items: Iterable[tuple], progress: Callable[[int], None] | None = None) -> int:
+    """Do ``work`` on all items with a few threads (coding and scaling release the GIL); returns how many there were.
+
+    Items are taken as threads become free, so that few are held; the first error ends it.
+    """
+    workers = min(4, os.cpu_count() or 1)
+    waiting: deque[Future[None]] = deque()
+    done = 0
+
+    def finish_one() -> None:
+        nonlocal done
+        waiting.popleft().result()
+        done += 1
+        if progress is not None:
+            progress(done)
+
+    with ThreadPoolExecutor(workers) as pool:
         try:
-            for done, future in enumerate(futures, start=1):
-                future.result()
-                count(done, len(items), None)
+            for item in items:
+                waiting.append(pool.submit(work, *item))
+                if len(waiting) > workers:
+                    finish_one()
+            while waiting:
+                finish_one()
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+    return done
 
 
-def _signature(source: Source, *settings: float | int | None) -> str:
+def _signature(source: Source, sampling: Sampling, num_downscales: int) -> str:
     """Hash of everything the frames depend on: files by path, size and time of change."""
     files: Iterable[Path] = source.images or (source.path,)
     states = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    settings = [asdict(sampling) if source.kind == "video" else None, num_downscales]
     text = json.dumps([states, source.names, source.camera is None, settings])
     return hashlib.sha256(text.encode()).hexdigest()
 

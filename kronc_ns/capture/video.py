@@ -1,125 +1,173 @@
-"""Frames of a video by ffmpeg, which turns them upright as the video's rotation says."""
+"""Frames of a video, decoded one after the other by PyAV (ffmpeg's libraries) and turned upright."""
 
-import json
-import shutil
-import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from kronc_ns.capture.source import MIN_FRAMES, Count, natural_key
+import av
+import numpy as np
+from av.container import InputContainer
+from av.error import EOFError as EndOfFile
+from av.error import FFmpegError
+from jaxtyping import UInt8
+from PIL import Image
+
+from kronc_ns.capture.selection import Candidate, Sampling, choose
+from kronc_ns.capture.source import MIN_FRAMES, Count
+from kronc_ns.capture.tone import srgb
 from kronc_ns.errors import KroncError
 
-PATTERN = "frame_%05d.png"
-"""Names of extracted frames, counted from 1."""
+_GREY_LONG_SIDE = 960  # px of the copies on which frames are compared
+_THREADS = 4  # of the decoder: each holds frames
+_CUT_S = 0.5  # a file that ends earlier than it says, by more than this, was cut off
 
 
 @dataclass(frozen=True)
-class VideoInfo:
-    """What the container says."""
+class Timeline:
+    """When a video shows its frames, from the packets of the file alone."""
 
-    rate: float
-    """Frames per second."""
-    duration_s: float | None
+    first: int
+    """Presentation time of the first frame, in units."""
+    span: int
+    """From there to the end of the last frame."""
+    count: int
+    unit: Fraction
+    """Seconds."""
+    timed: bool
+    """Frames say their time; otherwise they are counted."""
+    promised_s: float
+    """Duration that the file gives itself; 0: none."""
+
+    def slot(self, time: int, sampling: Sampling) -> int:
+        """The slot in which a frame shown at ``time`` competes."""
+        since = max(0, time - self.first)
+        if sampling.fps is not None:
+            return int(since * self.unit * Fraction(sampling.fps).limit_denominator(1000))
+        return since if self.count <= sampling.num_frames else since * sampling.num_frames // self.span
 
 
-def probe_video(video: Path) -> VideoInfo:
-    """Rate and duration of the first video stream; raises `KroncError` where there is none."""
-    wanted = "stream=avg_frame_rate,r_frame_rate,duration:format=duration"
-    command = [_tool("ffprobe"), "-v", "error", "-select_streams", "v:0", "-show_entries", wanted, "-of", "json"]
-    done = subprocess.run([*command, _url(video)], capture_output=True, text=True, errors="replace", check=False)
+class VideoFrames:
+    """The frames of a video that are taken, decoded while iterating over them, once."""
+
+    def __init__(self, video: Path, sampling: Sampling, progress: Count | None = None) -> None:
+        self._video, self._sampling, self._progress = video, sampling, progress
+        self._timeline = read_timeline(video)
+        self._decoded = self._damaged = self._slots = self._taken = 0
+
+    def __iter__(self) -> Iterator[Image.Image]:
+        """Upright images in order, 8 bits a channel, sRGB."""
+        with _opened(self._video) as container:
+            for chosen in choose(self._candidates(container), self._sampling):
+                self._taken += 1
+                transfer = container.streams.video[0].codec_context.color_trc
+                yield Image.fromarray(_upright(chosen.content, transfer))
+        if self._taken < MIN_FRAMES:
+            raise KroncError(
+                f"{self._video} gives {self._taken} frames ({self.note() or f'{self._decoded} could be read'}): "
+                f"expected at least {MIN_FRAMES} views of the car; check the file, or raise --fps where it was given"
+            )
+
+    def note(self) -> str:
+        """What was left out and why; known when the iteration has ended."""
+        ended_s = float(self._timeline.span * self._timeline.unit)
+        notes = []
+        if self._timeline.promised_s - ended_s > _CUT_S:
+            notes.append(f"the file ends after {ended_s:.1f} of {self._timeline.promised_s:.1f} s")
+        if self._damaged:
+            notes.append(f"{self._damaged} of {self._timeline.count} frames are damaged and were left out")
+        if self._slots > self._taken:
+            notes.append(f"{self._slots - self._taken} that show nothing new were left out")
+        return "; ".join(notes)
+
+    def _candidates(self, container: InputContainer) -> Iterator[Candidate[av.VideoFrame]]:
+        last, whole = -1, True
+        for frame in _decode(container):
+            # damage spreads until a frame that refers to no other
+            whole = frame is not None and not frame.is_corrupt and (whole or frame.key_frame)
+            if frame is None or not whole:
+                self._damaged += 1
+                continue
+            time = frame.pts if self._timeline.timed and frame.pts is not None else self._decoded
+            slot = max(last, self._timeline.slot(time, self._sampling))
+            self._decoded += 1
+            self._slots += slot != last
+            last = slot
+            if self._progress is not None:
+                self._progress(self._decoded, max(self._decoded, self._timeline.count), None)
+            yield Candidate(frame, slot, _grey(frame))
+
+
+def probe_video(video: Path) -> None:
+    """Raise `KroncError` unless ffmpeg's libraries find a video stream in the file."""
+    with _opened(video):
+        pass
+
+
+def read_timeline(video: Path) -> Timeline:
+    """Look at every packet without decoding any."""
+    with _opened(video) as container:
+        stream = container.streams.video[0]
+        times: list[int | None] = []
+        with suppress(FFmpegError):  # what comes before can be used
+            for packet in container.demux(stream):
+                if packet.size and not packet.is_discard:
+                    times.append(packet.pts)
+        promised_s = float((stream.duration or 0) * (stream.time_base or 0)) or (container.duration or 0) / av.time_base
+        known = sorted(time for time in times if time is not None)
+        timed = len(known) == len(times) > 1 and known[-1] > known[0] and stream.time_base is not None
+        if not timed:
+            rate = stream.average_rate or stream.base_rate or Fraction(30)
+            return Timeline(0, max(1, len(times)), len(times), 1 / rate, False, promised_s)
+        span = known[-1] - known[0]
+        step = max(1, round(span / (len(known) - 1)))
+        return Timeline(known[0], span + step, len(known), Fraction(stream.time_base or 1), True, promised_s)
+
+
+@contextmanager
+def _opened(video: Path) -> Iterator[InputContainer]:
+    reason = "no video stream"
     try:
-        content = json.loads(done.stdout)
-    except json.JSONDecodeError:
-        content = {}
-    if done.returncode or not content.get("streams"):
-        raise KroncError(
-            f"{video} is no video that ffmpeg can read ({_last_line(done.stderr, video) or 'no video stream'}): "
-            "expected a video file, a folder of photos or a scene folder"
-        )
-    stream = content["streams"][0]
-    rate = _rate(stream.get("avg_frame_rate")) or _rate(stream.get("r_frame_rate"))
-    durations = (_seconds(part.get("duration")) for part in (stream, content.get("format", {})))
-    duration = next((seconds for seconds in durations if seconds), None)
-    if not rate:
-        raise KroncError(f"{video} does not say its frame rate: expected a video with several frames")
-    return VideoInfo(rate, duration)
+        with av.open(f"file:{video.resolve()}") as container:
+            if container.streams.video and container.streams.video[0].codec_context is not None:
+                yield container
+                return
+    except FFmpegError as error:
+        reason = error.strerror or str(error)
+    raise KroncError(
+        f"{video} is no video that ffmpeg's libraries can read ({reason}): "
+        "expected a video file, a folder of photos or a scene folder"
+    )
 
 
-def sampling_rate(video: Path, info: VideoInfo, fps: float, num_frames_target: int | None) -> float:
-    """Frames per second to extract: ``fps``, or what gives the target; never more than the video has."""
-    if num_frames_target is None:
-        return min(fps, info.rate)
-    if info.duration_s is None:
-        raise KroncError(f"{video} does not say how long it is: use --fps instead of --num-frames-target")
-    return min(num_frames_target / info.duration_s, info.rate)
-
-
-def extract_frames(
-    video: Path, folder: Path, fps: float, num_frames_target: int | None, progress: Count | None = None
-) -> tuple[Path, ...]:
-    """Write frames of ``video`` as PNG (8 bits a channel, upright) into ``folder`` and list them."""
-    info = probe_video(video)
-    rate = sampling_rate(video, info, fps, num_frames_target)
-    expected = max(1, round((info.duration_s or 0) * rate))
-    command = [_tool("ffmpeg"), "-nostdin", "-hide_banner", "-loglevel", "error", "-y", "-i", _url(video)]
-    command += ["-map", "0:v:0", "-vf", f"fps={rate:.9g}", "-pix_fmt", "rgb24", "-progress", "pipe:1", PATTERN]
-    with subprocess.Popen(
-        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
-    ) as process:
-        complaints = []
+def _decode(container: InputContainer) -> Iterator[av.VideoFrame | None]:
+    """Frames in the order in which they are shown; None for each packet that cannot be decoded."""
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    stream.codec_context.thread_count = _THREADS
+    stream.codec_context.options = {"err_detect": "explode"}  # no frames with made-up parts
+    packets = container.demux(stream)
+    while True:
         try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                key, _, value = line.strip().partition("=")
-                if key == "frame" and value.strip().isdecimal() and progress is not None:
-                    progress(int(value), max(expected, int(value)), None)
-                elif " " in key:  # the keys of -progress are single words
-                    complaints.append(line.strip())
-        except BaseException:
-            process.kill()
-            raise
-    frames = tuple(sorted(folder.glob("frame_*.png"), key=lambda file: natural_key(file.name)))
-    complaint = _last_line("\n".join(complaints), video)
-    if process.returncode:
-        why = complaint or f"status {process.returncode}"
-        raise KroncError(f"ffmpeg stopped on {video} ({why}): check the file and the space in {folder}")
-    if len(frames) < MIN_FRAMES:
-        why = f" ({complaint})" if complaint else ""
-        raise KroncError(
-            f"{video} gives {len(frames)} frames at {rate:g} frames per second{why}: expected at least {MIN_FRAMES}; "
-            "raise --fps or --num-frames-target, or check the file"
-        )
-    return frames
+            packet = next(packets, None)
+        except FFmpegError:
+            packet = None  # the file is cut off; the timeline tells
+        if packet is None:
+            return
+        try:
+            yield from packet.decode()
+        except EndOfFile:
+            return
+        except FFmpegError:
+            yield None
 
 
-def _tool(name: str) -> str:
-    path = shutil.which(name)
-    if path is None:
-        raise KroncError(
-            f"{name} is not on PATH, and videos need it: install ffmpeg, or give a folder of frames as --data"
-        )
-    return path
+def _grey(frame: av.VideoFrame) -> UInt8[np.ndarray, "h w"]:
+    factor = min(1.0, _GREY_LONG_SIDE / max(frame.width, frame.height))
+    width, height = (max(1, round(side * factor)) for side in (frame.width, frame.height))
+    return frame.reformat(width, height, "gray", interpolation="AREA").to_ndarray()
 
 
-def _url(video: Path) -> str:
-    return f"file:{video.resolve()}"
-
-
-def _last_line(text: str, video: Path) -> str:
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1].removeprefix(f"{_url(video)}: ") if lines else ""
-
-
-def _rate(text: str | None) -> float:
-    try:
-        return float(Fraction(text or "0"))
-    except (ValueError, ZeroDivisionError):
-        return 0.0
-
-
-def _seconds(text: str | None) -> float | None:
-    try:
-        return float(text) if text else None
-    except ValueError:
-        return None
+def _upright(frame: av.VideoFrame, transfer: int | None) -> UInt8[np.ndarray, "h w 3"]:
+    return np.ascontiguousarray(np.rot90(srgb(frame, transfer), round(frame.rotation / 90)))

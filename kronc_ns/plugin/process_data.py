@@ -17,7 +17,8 @@ from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics
 from kronc_ns.capture.masks import find_masks, write_masks
 from kronc_ns.capture.segmentation.choice import SegmenterOptions, segment_car
 from kronc_ns.capture.segmentation.segmenter import Segmenter
-from kronc_ns.capture.source import MIN_FRAMES, Source, find_source
+from kronc_ns.capture.selection import Sampling
+from kronc_ns.capture.source import Source, find_source
 from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
 from kronc_ns.errors import KroncError
@@ -50,10 +51,10 @@ class KroncToNerfstudio:
     """Folder with a mask for each image, of the same stem: above 127 the car, else ignored."""
     segmentation: Annotated[SegmenterOptions, tyro.conf.arg(name="")] = field(default_factory=SegmenterOptions)
     """How masks are made, where there are none."""
-    fps: float = 5.0
-    """Frames per second taken from a video."""
-    num_frames_target: int | None = None
-    """Take about this many frames from a video, evenly spread, instead of --fps."""
+    num_frames: int = 100
+    """Frames taken from a video: the sharpest of as many equal spans of time, unless nothing has moved."""
+    fps: float | None = None
+    """Frames per second taken from a video, sharp or not, instead (5 in the paper)."""
     focal_length_px: float | None = None
     """Focal length in pixels of the full-size image. Default: from transforms.json, else from EXIF."""
     fov_deg: float = 65.0
@@ -80,7 +81,7 @@ class KroncToNerfstudio:
         found = None if detector else self._read_keypoints(source)
         early = None if size is None else self._intrinsics(source, size)
         out = self.output_dir
-        settings = (self.fps, self.num_frames_target, self.num_downscales)
+        settings = (Sampling(self.num_frames, self.fps), self.num_downscales)
         frames = find_frames(source, out, *settings)
         if frames is None and self.keypoints is not None and self.keypoints.resolve().is_relative_to(out.resolve()):
             raise KroncError(
@@ -117,7 +118,8 @@ class KroncToNerfstudio:
         table = report_table(report, (*scene.notes, *([note] if note else [])))
         levels = "".join(f", 1/{factor}" for factor in frames.factors)
         origin = "as an earlier run left them" if frames.reused else f"from {source.kind} {self.data}"
-        table.add_row("frames", f"{len(frames.names)} of {frames.size[0]}x{frames.size[1]}{levels}, {origin}")
+        left_out = f"; {frames.note}" if frames.note else ""
+        table.add_row("frames", f"{len(frames.names)} of {frames.size[0]}x{frames.size[1]}{levels}, {origin}{left_out}")
         if mask_note:
             table.add_row("masks", mask_note)
         table.add_row("keypoints", _seen(scene))
@@ -131,10 +133,7 @@ class KroncToNerfstudio:
         return status
 
     def _check_options(self) -> None:
-        if not self.fps > 0:
-            raise KroncError(f"--fps is {self.fps:g}: expected a number above 0")
-        if self.num_frames_target is not None and self.num_frames_target < MIN_FRAMES:
-            raise KroncError(f"--num-frames-target is {self.num_frames_target}: expected at least {MIN_FRAMES}")
+        Sampling(self.num_frames, self.fps)
         if self.num_downscales < 0:
             raise KroncError(f"--num-downscales is {self.num_downscales}: expected 0 or more")
         data, out = self.data.resolve(), self.output_dir.resolve()
@@ -233,9 +232,10 @@ def _assumption(intrinsics: Intrinsics) -> str:
 
 def _how_to_go_on(frames: Frames, out: Path) -> str:
     images = out / "images"
+    note = f" ({frames.note})" if frames.note else ""
     return (
-        f"{len(frames.names)} frames are ready in {images}, but there are no keypoints: run the same command again "
-        f"with `--detector openpifpaf`, which finds them, or with `--keypoints` ({FORMATS})"
+        f"{len(frames.names)} frames are ready in {images}{note}, but there are no keypoints: run the same command "
+        f"again with `--detector openpifpaf`, which finds them, or with `--keypoints` ({FORMATS})"
     )
 
 

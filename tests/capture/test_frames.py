@@ -1,22 +1,17 @@
 """Photos and videos become upright frames of one size, and what cannot is named."""
 
 import json
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from kronc_ns.capture import video as video_module
 from kronc_ns.capture.frames import Frames, check_source, copy_reference, find_frames, frame_names, prepare_frames
 from kronc_ns.capture.images import downscale, downscale_factors
 from kronc_ns.capture.masks import downscale_mask, find_masks, read_mask, write_masks
 from kronc_ns.capture.source import find_source, natural_key
 from kronc_ns.errors import KroncError
-
-needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 
 
 def _picture(width: int = 64, height: int = 48, seed: int = 0) -> Image.Image:
@@ -33,15 +28,6 @@ def _photo(path: Path, orientation: int | None = None, seed: int = 0, size: tupl
     if orientation is not None:
         exif[ExifTags.Base.Orientation] = orientation
     _picture(*size, seed=seed).save(path, exif=exif)
-    return path
-
-
-def _video(path: Path, frames: int = 20, rate: int = 10, size: tuple[int, int] = (64, 48)) -> Path:
-    folder = path.parent / "rendered"
-    for i in range(frames):
-        _photo(folder / f"{i:03d}.png", seed=i, size=size)
-    command = ["ffmpeg", "-v", "error", "-y", "-framerate", str(rate), "-i", str(folder / "%03d.png")]
-    subprocess.run([*command, "-pix_fmt", "yuv420p", str(path)], check=True)
     return path
 
 
@@ -243,80 +229,3 @@ def test_the_reference_gets_the_new_names(tmp_path: Path):
     copied = json.loads((tmp_path / "out" / "reference.json").read_text())
     expected = [{"file_path": f"images/frame_0000{i}.png", "transform_matrix": matrix} for i in (1, 2)]
     assert copied == {"w": 64, "frames": expected}
-
-
-@needs_ffmpeg
-def test_video_frames_come_at_the_rate_asked_for(tmp_path: Path):
-    video = _video(tmp_path / "walk 100%.mp4")  # 2 s at 10 frames per second
-    steps: list[int] = []
-    frames = _prepare(video, tmp_path / "out", fps=5.0, progress=lambda step, steps_, _: steps.append(step))
-    assert len(frames.names) == 10
-    assert frames.names[0] == "images/frame_00001.png"
-    assert frames.source_names == frames.names
-    assert steps
-    with Image.open(tmp_path / "out" / frames.names[-1]) as image:
-        assert image.mode == "RGB"
-        assert image.size == (64, 48)
-    assert _prepare(video, tmp_path / "out", fps=5.0).reused
-    target = _prepare(video, tmp_path / "out", num_frames_target=4)
-    assert not target.reused
-    assert len(target.names) == 4
-    assert len(list((tmp_path / "out" / "images").iterdir())) == 4
-
-
-@needs_ffmpeg
-def test_a_video_never_gives_the_same_frame_twice(tmp_path: Path):
-    video = _video(tmp_path / "walk.mp4", frames=6)
-    assert len(_prepare(video, tmp_path / "a", fps=240.0).names) == 6
-    assert len(_prepare(video, tmp_path / "b", num_frames_target=500).names) == 6
-
-
-@needs_ffmpeg
-def test_rotation_of_a_video_is_honoured(tmp_path: Path):
-    plain = _video(tmp_path / "plain.mp4")
-    turned = tmp_path / "turned.mp4"
-    command = ["ffmpeg", "-v", "error", "-i", str(plain), "-c", "copy", "-metadata:s:v:0", "rotate=90", str(turned)]
-    subprocess.run(command, check=True)
-    probe = subprocess.run(["ffprobe", "-v", "error", "-show_streams", str(turned)], capture_output=True, text=True)
-    if "rotation" not in probe.stdout:
-        command = [
-            "ffmpeg",
-            "-v",
-            "error",
-            "-y",
-            "-display_rotation",
-            "90",
-            "-i",
-            str(plain),
-            "-c",
-            "copy",
-            str(turned),
-        ]
-        subprocess.run(command, check=True)
-    frames = _prepare(turned, tmp_path / "out")
-    assert frames.size == (48, 64)
-    with Image.open(tmp_path / "out" / frames.names[0]) as image:
-        assert image.size == (48, 64)
-        assert _is_red(image, (0.5, 0.1)) != _is_red(image, (0.5, 0.9))
-
-
-@needs_ffmpeg
-def test_videos_that_cannot_be_used_are_named(tmp_path: Path):
-    video = _video(tmp_path / "walk.mp4", frames=4)
-    with pytest.raises(KroncError, match=r"gives [12] frames at 5 .*raise --fps"):
-        _prepare(video, tmp_path / "short")
-    broken = tmp_path / "broken.mp4"
-    broken.write_bytes(video.read_bytes()[:200])
-    with pytest.raises(KroncError, match=r"broken\.mp4 is no video that ffmpeg can read \(.+\): expected a video"):
-        check_source(find_source(broken))
-    sound = tmp_path / "sound.wav"
-    subprocess.run(["ffmpeg", "-v", "error", "-f", "lavfi", "-i", "sine=duration=0.1", str(sound)], check=True)
-    with pytest.raises(KroncError, match="no video stream"):
-        check_source(find_source(sound))
-
-
-def test_a_missing_ffmpeg_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "walk.mp4").touch()
-    monkeypatch.setattr(video_module.shutil, "which", lambda _: None)
-    with pytest.raises(KroncError, match=r"ffprobe is not on PATH.*install ffmpeg"):
-        check_source(find_source(tmp_path / "walk.mp4"))

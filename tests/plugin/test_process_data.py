@@ -229,11 +229,11 @@ def test_video_in_two_runs(
     video, out = tmp_path / "walk.mp4", tmp_path / "out"
     command = ["ffmpeg", "-v", "error", "-framerate", "6", "-i", str(scene / "images" / "IMG_%d.jpg"), str(video)]
     subprocess.run(command, check=True)
-    options = {"data": video, "output_dir": out, "fps": 6.0, "solve": config}
+    options = {"data": video, "output_dir": out, "solve": config}
     assert _status(KroncToNerfstudio(**options)) == 2
     err = capsys.readouterr().err.splitlines()
     assert err[0].startswith("warning: focal length 377 px is an assumed field of view of 65 deg")
-    assert err[1].startswith("error: 12 frames are ready")
+    assert err[1].startswith("error: 12 frames are ready in")
     assert len(list((out / "images").iterdir())) == VIEWS
     _write_openpifpaf(tmp_path / "pifpaf", capture, [f"frame_{i:05d}.png" for i in range(1, VIEWS + 1)])
     assert _status(KroncToNerfstudio(keypoints=tmp_path / "pifpaf", **options)) in (0, 3)  # 377 px, in truth 400
@@ -263,7 +263,7 @@ def test_a_doubtful_solution_is_written_and_ends_with_3(
     [
         ({"data": Path("nowhere")}, "nowhere does not exist: expected a scene folder"),
         ({"fps": 0.0}, "--fps is 0: expected a number above 0"),
-        ({"num_frames_target": 2}, "--num-frames-target is 2: expected at least 3"),
+        ({"num_frames": 2}, "--num-frames is 2: expected at least 3"),
         ({"num_downscales": -1}, "--num-downscales is -1"),
         ({"masks": Path("nowhere")}, "--masks nowhere is no folder"),
         ({"keypoints": Path("nowhere.json")}, "nowhere.json does not exist: expected our keypoints.json"),
@@ -417,7 +417,7 @@ def test_help_names_every_option(capsys: pytest.CaptureFixture[str], monkeypatch
         "keypoints",
         "masks",
         "fps",
-        "num-frames-target",
+        "num-frames",
         "focal-length-px",
         "config",
         "detector",
