@@ -107,8 +107,8 @@ def _poses(subject: Subject, poses: PosesOf, options: FieldOptions) -> tuple[Flo
     elif poses == "circle":
         c2w = circular_poses(len(subject.truth), options.radius_m, "ccw", 1.0)
     else:
-        real = KroncConfig(init="circular", radius_m=options.radius_m, adam=AdamConfig(learning_rate=0.001))
-        c2w = place(poses, subject, None, real if poses == "adam" else None).c2w
+        circle = KroncConfig(init="circular", radius_m=options.radius_m, adam=AdamConfig(learning_rate=0.01))
+        c2w = place(poses, subject, None, circle if poses == "adam" else None).c2w
     posed = c2w.isfinite().all(-1).all(-1)
     if int(posed.sum()) < 3:
         raise KroncError(f"{poses} places {int(posed.sum())} views of {subject.name}: nothing to train on")
