@@ -26,7 +26,7 @@ from kronc_ns.solve.adam import AdamConfig
 PosesOf = Method | Literal["reference", "circle"]
 _PAPER = {
     "reference": "29.20 (29.31), COLMAP's poses",
-    "colmap incremental": "29.20 (29.31)",
+    "colmap-incremental": "29.20 (29.31)",
     "adam": "19.41 (21.89)",
     "circle": "12.0 on its easiest scene",
 }
@@ -41,7 +41,7 @@ class FieldOptions:
     """New or empty folder for the table (fields.md, fields.json), the data sets and the runs."""
     captures: tuple[Path, ...]
     """Scene folders with images, masks and poses to compare with in reference.json."""
-    poses: tuple[PosesOf, ...] = ("reference", "kronc", "adam", "colmap incremental", "circle")
+    poses: tuple[PosesOf, ...] = ("reference", "kronc", "adam", "colmap-incremental", "circle")
     """Whose poses; all but the reference's are found without a start (Adam begins on the circle)."""
     method: str = "kronc-splatfacto-cpu"
     """Method of `ns-train`."""
@@ -83,7 +83,7 @@ def make_field_table(options: FieldOptions) -> None:
 
 def _row(subject: Subject, poses: PosesOf, options: FieldOptions, commands: Commands) -> dict[str, Any]:
     c2w, errors = _poses(subject, poses, options)
-    data = options.output_dir / subject.name / poses.replace(",", "").replace(" ", "_")
+    data = options.output_dir / subject.name / poses
     assert subject.folder is not None
     write_poses(data, subject.folder, subject.scene, c2w, subject.points)
     results: dict[str, Any] = {}

@@ -28,15 +28,16 @@ Method = Literal[
     "kronc",
     "adam",
     "ceres",
-    "colmap incremental",
-    "colmap global",
-    "colmap incremental, masked",
-    "colmap global, masked",
-    "keypoints, colmap incremental",
-    "keypoints, colmap global",
+    "colmap-incremental",
+    "colmap-global",
+    "colmap-incremental-masked",
+    "colmap-global-masked",
+    "keypoints-incremental",
+    "keypoints-global",
 ]
 """kronc: the default solver; adam: the paper's; ceres: bundle adjustment of the same keypoints by pycolmap with a
-Cauchy loss; colmap: its mappers on SIFT features (all of them, or the masked vehicle's), or on the same keypoints."""
+Cauchy loss; colmap-...: COLMAP's mappers on SIFT features (all of them, or the vehicle's); keypoints-...: the same
+mappers on the keypoints."""
 
 START = (4.0, 0.5)
 """The paper's noise of initial poses: degrees, metres."""
@@ -143,13 +144,13 @@ def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfi
             start = scene.given_c2w
             start = circular_poses(len(scene), KroncConfig().radius_m, "ccw", 1.0) if start is None else start
             return bundle_adjustment(scene, start, loss="cauchy").c2w
-        case "colmap incremental" | "colmap global" | "colmap incremental, masked" | "colmap global, masked":
+        case "colmap-incremental" | "colmap-global" | "colmap-incremental-masked" | "colmap-global-masked":
             if folder is None:
                 raise KroncError(f"{method} needs images: give scene folders with --captures")
             return map_images(scene, folder, "global" if "global" in method else "incremental", "masked" in method)
-        case "keypoints, colmap incremental":
+        case "keypoints-incremental":
             return map_keypoints(scene, "incremental")
-        case "keypoints, colmap global":
+        case "keypoints-global":
             return map_keypoints(scene, "global")
         case _:
             assert_never(method)

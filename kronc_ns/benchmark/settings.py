@@ -15,12 +15,12 @@ _ADAM = KroncConfig(solver="adam", adam=AdamConfig(learning_rate=0.01))
 _ADAM_FROM_CIRCLE = replace(_ADAM, init="circular")
 _SUBSETS = (1.0, 0.75, 0.5, 0.25, 0.1)
 _PRIOR_NOISE = 0.1
-_ON_KEYPOINTS: tuple[Method, ...] = ("kronc", "adam", "keypoints, colmap incremental", "keypoints, colmap global")
+_ON_KEYPOINTS: tuple[Method, ...] = ("kronc", "adam", "keypoints-incremental", "keypoints-global")
 _ON_IMAGES: tuple[Method, ...] = (
-    "colmap incremental",
-    "colmap global",
-    "colmap incremental, masked",
-    "colmap global, masked",
+    "colmap-incremental",
+    "colmap-global",
+    "colmap-incremental-masked",
+    "colmap-global-masked",
 )
 
 
@@ -32,7 +32,7 @@ def main(options: TableOptions) -> list[Setting]:
             of_paper = _paper(paper.BY_NOISE[START]) if method == "adam" else {}
             rows.append(_solved({}, method, noise_px, paper=of_paper))
         rows.append(_solved({"start": "none"}, "kronc", noise_px, start=None))
-        for method in ("keypoints, colmap incremental", "keypoints, colmap global"):
+        for method in ("keypoints-incremental", "keypoints-global"):
             rows.append(_solved({"start": "none"}, method, noise_px, start=None))
     return [replace(row, labels={"start": _start(row), **row.labels}) for row in rows]
 

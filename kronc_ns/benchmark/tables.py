@@ -33,6 +33,8 @@ class TableOptions:
     noise_px: tuple[float, ...] = (0.0, 1.0)
     """Noise of the keypoints: standard deviation along each axis, in pixels of the capture. What comes with a folder
     as measured keypoints is taken as it is with 0."""
+    methods: tuple[Method, ...] = ()
+    """Only rows of these methods; default: all that the table has."""
     first_seed: int = 0
     """Seed of the first subject's noise and, of procedural cars, shape."""
 
@@ -70,7 +72,10 @@ def make_table(
 ) -> None:
     """Measure all settings on all subjects; print the table and write it."""
     begin = time.perf_counter()
-    machine, subjects, chosen = hardware(), options.subjects(), settings(options)
+    machine, subjects = hardware(), options.subjects()
+    chosen = [row for row in settings(options) if row.method in (options.methods or (row.method,))]
+    if not chosen:
+        raise KroncError(f"--methods {' '.join(map(repr, options.methods))}: {name} has no row of these")
     rows: list[dict[str, Any]] = []
     with progress_bar(name) as progress:
         for done, setting in enumerate(chosen):
