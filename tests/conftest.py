@@ -3,9 +3,12 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import jaxtyping
+import numpy as np
 import pytest
 
 with jaxtyping.install_import_hook(
@@ -36,6 +39,7 @@ with jaxtyping.install_import_hook(
         "kronc_ns.solved",
         "kronc_ns.report",
         "kronc_ns.stages",
+        "kronc_ns.viewer",
     ],
     "beartype.beartype",
 ):
@@ -52,8 +56,11 @@ with jaxtyping.install_import_hook(
 
 import torch
 
+from kronc_ns.export import claim_output, write_solution
 from kronc_ns.init import noisy_poses
-from kronc_ns.scene import Scene
+from kronc_ns.options import KroncConfig
+from kronc_ns.pipeline import solve_scene
+from kronc_ns.scene import Scene, load_scene
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, make_capture
 
@@ -105,6 +112,22 @@ def edit():
         path.write_text(json.dumps(content))
 
     return apply
+
+
+@pytest.fixture(scope="session")
+def solved_lap_folder(tmp_path_factory: pytest.TempPathFactory, lap: Capture) -> Path:
+    """The lap of 20 views solved, the fifth of them without keypoints and every other with an image; for reading."""
+    folder = tmp_path_factory.mktemp("lap")
+    keypoints = lap.keypoints.clone()
+    keypoints[4, :, 2] = 0
+    write_capture(folder / "walk", replace(lap, keypoints=keypoints))
+    scene = load_scene(folder / "walk")
+    claim_output(folder / "out")
+    write_solution(folder / "out", scene, solve_scene(scene, KroncConfig()), folder / "walk", "abc")
+    (folder / "walk/images").mkdir()
+    for name in scene.names[::2]:
+        cv2.imwrite(str(folder / "walk" / name), np.full((lap.camera.height, lap.camera.width, 3), 90, np.uint8))
+    return folder / "out"
 
 
 BROWSER_PATIENCE_MS = 180_000

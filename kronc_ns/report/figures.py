@@ -44,7 +44,7 @@ def cameras_3d(scene: Scene, solution: Solution) -> go.Figure | None:
             go.Scatter3d(
                 **_xyz(after[chosen][..., 3]),
                 mode="markers",
-                marker={"size": 2.5 if len(after) < CROWDED else 1.5},
+                marker={"size": 1.5 if len(after) < CROWDED else 1},
                 meta=status.value,
                 text=labels,
                 hoverinfo="text",
@@ -67,7 +67,7 @@ def cameras_3d(scene: Scene, solution: Solution) -> go.Figure | None:
             "aspectmode": "manual",
             "aspectratio": {axis: size[i] / max(size) for i, axis in enumerate("xyz")},
             **{f"{axis}axis": {"title": axis, "range": [low[i], high[i]]} for i, axis in enumerate("xyz")},
-            "camera": {"eye": {"x": 0.72, "y": -0.72, "z": 0.5}, "center": {"x": 0, "y": 0, "z": -0.07}},
+            "camera": {"eye": {"x": 0.72, "y": -0.72, "z": 0.5}, "center": {"x": 0, "y": 0, "z": -0.14}},
         },
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
     )
@@ -154,7 +154,15 @@ def _layout(height: int = 360) -> dict:
         "template": "none",
         "height": height,
         "margin": {"l": 64, "r": 16, "t": 36, "b": 48},
-        "legend": {"traceorder": "normal", "orientation": "h", "x": 0, "y": 1, "xanchor": "left", "yanchor": "bottom"},
+        "legend": {
+            "traceorder": "normal",
+            "orientation": "h",
+            "x": 0,
+            "y": 1,
+            "xanchor": "left",
+            "yanchor": "bottom",
+            "itemsizing": "constant",
+        },
         "uirevision": "kept",  # the reader's zoom outlives a change between light and dark
         "hoverlabel": {"align": "left"},
     }

@@ -2,19 +2,13 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from kronc_ns.export import claim_output, write_solution
-from kronc_ns.options import KroncConfig
-from kronc_ns.pipeline import solve_scene
 from kronc_ns.report import write_report
-from kronc_ns.scene import load_scene
-from kronc_ns.synthetic.folder import write_capture
 from tests.conftest import BROWSER_PATIENCE_MS
 
 pytestmark = pytest.mark.slow
@@ -23,19 +17,8 @@ VIEWS, EMPTY = 20, 4
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory, lap) -> Path:
-    """A walk with a view without keypoints and half of the images, solved and reported."""
-    folder = tmp_path_factory.mktemp("report")
-    keypoints = lap.keypoints.clone()
-    keypoints[EMPTY, :, 2] = 0
-    write_capture(folder / "walk", replace(lap, keypoints=keypoints))
-    scene = load_scene(folder / "walk")
-    claim_output(folder / "out")
-    write_solution(folder / "out", scene, solve_scene(scene, KroncConfig()), folder / "walk", "abc")
-    (folder / "walk/images").mkdir()
-    for name in scene.names[::2]:
-        cv2.imwrite(str(folder / "walk" / name), np.full((lap.camera.height, lap.camera.width, 3), 90, np.uint8))
-    return write_report(folder / "out")
+def report(solved_lap_folder: Path) -> Path:
+    return write_report(solved_lap_folder)
 
 
 @contextmanager
