@@ -218,6 +218,23 @@ class Report:
         return 0
 
 
+@dataclass(kw_only=True)
+class View:
+    """See solved cameras and keypoints in 3D in the browser: images, rays, before and after, every view's residuals."""
+
+    data: Path
+    """Folder that `kronc solve` or `ns-process-data kronc` wrote."""
+    port: int = 8080
+    """Where the browser finds it: http://localhost:PORT, on this machine only."""
+
+    def run(self) -> int:
+        """Serve until Ctrl-C."""
+        from kronc_ns.viewer import view
+
+        view(self.data, self.port)
+        return 0
+
+
 Command = (
     Annotated[Solve, tyro.conf.subcommand("solve")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
@@ -225,6 +242,7 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[ConvertDetector, tyro.conf.subcommand("convert-detector")]
 )
 

@@ -157,6 +157,22 @@ def test_synth_solve_eval_export(scene, short, kronc, tmp_path):
         assert contents(tmp_path) == kept
 
 
+def test_report_writes_one_file_beside_the_solution(solved, kronc):
+    before = contents(solved)
+    result = kronc("report", "--data", solved)
+    assert (result.status, result.out, result.err) == (0, f"{solved / 'report.html'}\n", "")
+    after = contents(solved)
+    assert b"images/frame_00001.png" in after.pop("report.html")
+    assert after == before
+
+
+@pytest.mark.parametrize("command", ["report", "view"])
+def test_report_and_view_want_a_solved_folder(command, scene, kronc):
+    before = contents(scene)
+    assert kronc(command, "--data", scene).refused(str(scene / "kronc.json"), "kronc solve")
+    assert contents(scene) == before
+
+
 def test_a_process_of_its_own_prints_no_more_than_that(scene, hasty, tmp_path, edit):
     """No warning, progress bar or log line gets between."""
     edit(scene / "keypoints.json", lambda c: c["frames"][3].update(keypoints=[[0, 0, 0]] * 66))
