@@ -14,6 +14,7 @@ from rich.table import Table
 
 from kronc_ns.batch import expand, solve_folders
 from kronc_ns.benchmark.command import Bench
+from kronc_ns.capture.datasets import import_dataset
 from kronc_ns.capture.detection.conversion import ConvertDetector
 from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, metrics_table, progress_bar, report_table
@@ -178,6 +179,25 @@ class Synth:
 
 
 @dataclass(kw_only=True)
+class Import:
+    """Make a scene folder from a CarPatch scene, or from images with keypoints and a COLMAP model (KRONC-dataset)."""
+
+    data: Path
+    """CarPatch: transforms_SPLIT.json as of NeRF-synthetic, images, and keypoints_SPLIT.json or SPLIT/keypoints.json.
+    Else: images/ or frames/, COLMAP's sparse/0, keypoints.json or keypoints/, and optionally masks/."""
+    output_dir: Path
+    """New or empty folder for the scene; the poses that came along go to reference.json."""
+    splits: tuple[str, ...] = ("train", "test")
+    """Splits of CarPatch to take, one after the other."""
+
+    def run(self) -> int:
+        """Write the scene folder."""
+        views = import_dataset(self.data, self.output_dir, self.splits)
+        print(f"{views} views: {self.output_dir}")
+        return 0
+
+
+@dataclass(kw_only=True)
 class Export:
     """Write solved poses in another format."""
 
@@ -239,6 +259,7 @@ Command = (
     Annotated[Solve, tyro.conf.subcommand("solve")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Report, tyro.conf.subcommand("report")]
