@@ -24,7 +24,8 @@ from kronc_ns.export import claim_output, write_colmap, write_ply, write_solutio
 from kronc_ns.init import noisy_poses
 from kronc_ns.pipeline import fingerprint, solve_scene
 from kronc_ns.scene import load_scene, read_poses
-from kronc_ns.synthetic.folder import write_capture
+from kronc_ns.synthetic.folder import Renderer, write_capture
+from kronc_ns.synthetic.mesh import load_mesh_car
 from kronc_ns.synthetic.scenes import default_camera, make_capture
 
 
@@ -141,6 +142,12 @@ class Synth:
     """Translation noise of the poses written to transforms.json."""
     render: bool = False
     """Draw images, masks and depth maps."""
+    renderer: Renderer = "builtin"
+    """builtin: a quick ray caster of the procedural car; blender: path-traced, of that car or any --mesh
+    (pip install 'kronc-ns[blender]', Python 3.11)."""
+    mesh: Path | None = None
+    """A car of your own instead of the procedural one: .glb or .gltf in true size, with its 66 keypoints in
+    keypoints3d.json beside it."""
     seed: int = 0
     """Seed of trajectory, detections and pose noise."""
 
@@ -162,8 +169,13 @@ class Synth:
             raise KroncError(
                 f"--views {self.views} --width {self.width}: expected at least 1 view of at least 16 pixels"
             )
+        if self.renderer != "builtin" and not self.render:
+            raise KroncError(f"--renderer {self.renderer} without --render: add --render, or nothing is drawn")
         camera = default_camera(self.preset, self.width)
-        capture = make_capture(self.preset, self.views, self.seed, self.noise_px, self.missing, self.outliers, camera)
+        car = load_mesh_car(self.mesh) if self.mesh is not None else None
+        capture = make_capture(
+            self.preset, self.views, self.seed, self.noise_px, self.missing, self.outliers, camera, car
+        )
         start = None
         if self.pose_noise_deg or self.pose_noise_m:
             generator = torch.Generator().manual_seed(self.seed)
@@ -171,7 +183,13 @@ class Synth:
         ground = self.preset == "walk"
         with progress_bar("rendering" if self.render else "writing") as progress:
             write_capture(
-                self.output_dir, capture, start, self.render, ground, lambda view: progress(view, self.views, None)
+                self.output_dir,
+                capture,
+                start,
+                self.render,
+                ground,
+                lambda view: progress(view, self.views, None),
+                self.renderer,
             )
         mean = float(capture.keypoints[..., 2].sum(1).mean())
         print(f"{self.views} views, {mean:.1f} keypoints a view: {self.output_dir}")

@@ -136,10 +136,10 @@ def _shade_rays(car: CarModel, eye: np.ndarray, ray: np.ndarray, footprint: floa
 
 def _shade_car(car: CarModel, p: np.ndarray, ray: np.ndarray, face: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """Colour [n,3] of points on the car: layers over the base colour, sun, sky, sheen and reflections."""
-    normal = _interpolated_normal(car.mesh, face, p)
+    normal = interpolated_normal(car.mesh, face, p)
     normal *= -np.sign(np.einsum("ni,ni->n", car.mesh.face_normals[face], ray) *
                        np.einsum("ni,ni->n", car.mesh.face_normals[face], normal))[:, None]  # fmt: skip
-    colour, gloss = _albedo(car, p, normal, face, footprint)
+    colour, gloss = albedo(car, p, normal, face, footprint)
     cos_view = np.clip(-np.einsum("ni,ni->n", normal, ray), 0, 1)
     occluded = np.clip(0.45 + 0.55 * (p[:, 2] - 0.05) / 0.5, 0.45, 1)
     sky = (0.52 + 0.24 * normal[:, 2]) * occluded
@@ -155,7 +155,7 @@ def _shade_car(car: CarModel, p: np.ndarray, ray: np.ndarray, face: np.ndarray, 
     return np.clip(shaded, 0, 1)
 
 
-def _interpolated_normal(mesh: trimesh.Trimesh, face: np.ndarray, p: np.ndarray) -> np.ndarray:
+def interpolated_normal(mesh: trimesh.Trimesh, face: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Unit normals [n,3] interpolated from the vertices of each face at points on it."""
     corner = mesh.faces[face]
     bary = trimesh.triangles.points_to_barycentric(mesh.vertices[corner], p)
@@ -163,7 +163,7 @@ def _interpolated_normal(mesh: trimesh.Trimesh, face: np.ndarray, p: np.ndarray)
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def _albedo(
+def albedo(
     car: CarModel, p: np.ndarray, normal: np.ndarray, face: np.ndarray, footprint: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colour [n,3] in 0..1 and gloss [n] after the material's layers are painted over its base."""

@@ -15,6 +15,7 @@ from kronc_ns.geometry.poses import compose, invert, look_at, make_pose, transfo
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.synthetic.car import CarModel, CarShape, build_car
 from kronc_ns.synthetic.hull import hull_visibility
+from kronc_ns.synthetic.mesh import MeshCar
 from kronc_ns.synthetic.render import keypoint_visibility
 
 Preset = Literal["carpatch", "walk"]
@@ -25,7 +26,7 @@ HEMISPHERE_RADIUS_M = 6.5
 class Capture:
     """A synthetic capture: the truth, and the detections a solver gets to see."""
 
-    car: CarModel | None
+    car: CarModel | MeshCar | None
     """What was captured; None where only its keypoints are known (such a capture cannot be rendered)."""
     points: Float[Tensor, "j 3"]
     """True keypoints; the world is the car's frame (x forward, y left, z up, ground z = 0), metres."""
@@ -115,7 +116,7 @@ def detect(
 
 
 def observe(
-    subject: CarModel | Float[Tensor, "j 3"],
+    subject: CarModel | MeshCar | Float[Tensor, "j 3"],
     c2w: Float[Tensor, "n 3 4"],
     camera: Camera,
     rng: np.random.Generator,
@@ -125,7 +126,7 @@ def observe(
 ) -> Capture:
     """A capture of a car (visibility by ray casting) or of bare points (by their convex hull) from given poses."""
     centres = c2w[..., 3]
-    if isinstance(subject, CarModel):
+    if isinstance(subject, CarModel | MeshCar):
         car, points = subject, torch.from_numpy(subject.keypoints)
         visible = torch.from_numpy(keypoint_visibility(car.mesh, car.keypoints, centres.numpy()))
     else:
@@ -145,11 +146,11 @@ def make_capture(
     missing: float = 0.0,
     outliers: float = 0.0,
     camera: Camera | None = None,
-    shape: CarShape | None = None,
+    car: CarModel | MeshCar | None = None,
 ) -> Capture:
-    """A car, a trajectory, ray-cast visibility and simulated detections, all drawn from ``seed``."""
+    """A car (the procedural one), a trajectory, ray-cast visibility and simulated detections, drawn from ``seed``."""
     rng = np.random.default_rng(seed)
-    car = build_car(shape or CarShape())
+    camera = camera or default_camera(preset)
     match preset:
         case "carpatch":
             c2w = hemisphere_poses(views, HEMISPHERE_RADIUS_M, rng)
@@ -157,4 +158,6 @@ def make_capture(
             c2w = walk_poses(views, rng)
         case _:
             assert_never(preset)
-    return observe(car, c2w, camera or default_camera(preset), rng, noise_px, missing, outliers)
+    return observe(
+        car or build_car(CarShape()), c2w, camera or default_camera(preset), rng, noise_px, missing, outliers
+    )
