@@ -2,8 +2,10 @@
 
 import errno
 import math
+import signal
 import statistics
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import PurePosixPath
@@ -22,7 +24,12 @@ _METRICS = {"psnr": 2, "ssim": 4, "lpips": 4}  # decimals
 
 @contextmanager
 def exit_on_error() -> Iterator[None]:
-    """Turn errors a user can cause into one line on stderr and exit status 2; Ctrl-C into 130."""
+    """Turn errors a user can cause into one line on stderr and exit status 2; Ctrl-C into 130, SIGTERM into 143.
+
+    Either way everything is left as on an error, so that no child process goes on alone.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, _terminate) if in_main_thread else None
     try:
         yield
     except KroncError as error:
@@ -33,6 +40,14 @@ def exit_on_error() -> Iterator[None]:
         if error.errno in (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT):
             sys.exit(_fail(f"{error.filename or 'output'} cannot be written: {error.strerror}", 2))
         raise
+    finally:
+        if in_main_thread:
+            signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(*_: object) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: let the children be ended
+    sys.exit(_fail("terminated; the same command goes on where it stopped", 143))
 
 
 def exit_status(report: Mapping[str, Any]) -> int:

@@ -2,7 +2,9 @@
 
 import json
 import os
+import signal
 import stat
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -242,3 +244,32 @@ def test_a_conversion_that_fails_leaves_nothing(tmp_path: Path, fake):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["bin", "calls", "own.pkl", "ready.onnx"]
     with pytest.raises(KroncError, match=r"expected a name that ends in \.onnx"):
         ConvertDetector(**{**options, "output": tmp_path / "net"}).run()
+
+
+TERMINATED = """
+import sys
+from pathlib import Path
+from kronc_ns.capture.detection.detector import CarImage
+from kronc_ns.capture.detection.pifpaf import OpenPifPafDetector
+from kronc_ns.console import exit_on_error
+with exit_on_error():
+    list(OpenPifPafDetector(None, Path(sys.argv[1])).detect([CarImage(Path(sys.argv[2]))]))
+"""
+
+
+@pytest.mark.parametrize(("sent", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_child_ends_when_we_are_told_to(tmp_path: Path, fake, sent: signal.Signals, status: int):
+    pid = tmp_path / "pid"
+    program = fake(f"Path({str(pid)!r}).write_text(str(os.getpid()))\ntime.sleep(600)\n")
+    (image,) = photos(tmp_path, ("a.png",))
+    command = [sys.executable, "-c", TERMINATED, str(program), str(image.path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as parent:
+        while not (pid.exists() and pid.read_text()):
+            assert parent.poll() is None
+            time.sleep(0.01)
+        parent.send_signal(sent)
+        _, said = parent.communicate(timeout=120)
+    assert parent.returncode == status
+    assert len(said.splitlines()) == 1
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
