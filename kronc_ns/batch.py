@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from kronc_ns.capture.depth import with_depths
 from kronc_ns.console import progress_bar
 from kronc_ns.errors import KroncError
 from kronc_ns.export import claim_output, write_solution
@@ -47,7 +48,9 @@ def expand(patterns: Sequence[Path]) -> list[Path]:
     return folders
 
 
-def solve_folders(folders: Sequence[Path], output_dir: Path, config: KroncConfig) -> int:
+def solve_folders(
+    folders: Sequence[Path], output_dir: Path, config: KroncConfig, depth_weights: Path | None = None
+) -> int:
     """Solve every folder into ``output_dir`` / its name; one that fails does not stop the others.
 
     Prints a table; returns 2 where a scene could not be read or written, else 3 for a doubtful solution, else 0.
@@ -62,7 +65,7 @@ def solve_folders(folders: Sequence[Path], output_dir: Path, config: KroncConfig
     outcomes: list[Outcome] = []
     with progress_bar("scenes") as progress:
         for first in range(0, len(folders), _TOGETHER):
-            outcomes += _solve_some(folders[first : first + _TOGETHER], output_dir, config)
+            outcomes += _solve_some(folders[first : first + _TOGETHER], output_dir, config, depth_weights)
             progress(len(outcomes), len(folders), None)
     table = Table("scene", "status", "reason")
     for outcome in outcomes:
@@ -77,12 +80,14 @@ def solve_folders(folders: Sequence[Path], output_dir: Path, config: KroncConfig
     return 0 if all(outcome.status == Status.CONVERGED.value for outcome in outcomes) else 3
 
 
-def _solve_some(folders: Sequence[Path], output_dir: Path, config: KroncConfig) -> list[Outcome]:
+def _solve_some(
+    folders: Sequence[Path], output_dir: Path, config: KroncConfig, depth_weights: Path | None
+) -> list[Outcome]:
     outcomes: dict[Path, Outcome] = {}
     scenes: dict[Path, Scene] = {}
     for folder in folders:
         try:
-            scenes[folder] = load_scene(folder)
+            scenes[folder] = with_depths(load_scene(folder), folder, config, depth_weights)
         except KroncError as error:
             outcomes[folder] = Outcome(folder, "error", str(error))
     solutions = solve_scenes(list(scenes.values()), config)

@@ -15,6 +15,7 @@ from rich.table import Table
 from kronc_ns.batch import expand, solve_folders
 from kronc_ns.benchmark.command import Bench
 from kronc_ns.capture.datasets import import_dataset
+from kronc_ns.capture.depth import with_depths
 from kronc_ns.capture.detection.conversion import ConvertDetector
 from kronc_ns.config import SolverOptions
 from kronc_ns.console import exit_on_error, exit_status, metrics_table, progress_bar, report_table
@@ -41,6 +42,9 @@ class Solve(SolverOptions):
     keypoints: Path | None = None
     """Keypoints from elsewhere (of a single scene): our keypoints.json, a folder of OpenPifPaf *.predictions.json, or
     COCO JSON."""
+    depth_weights: Path | None = None
+    """For --depth-init prior without depth maps: folder or Hugging Face name of a DINOv2 model with a DPT head (default
+    facebook/dpt-dinov2-base-kitti, downloaded)."""
 
     def run(self) -> int:
         """Solve and write."""
@@ -49,10 +53,12 @@ class Solve(SolverOptions):
         if len(folders) > 1:
             if self.keypoints is not None:
                 raise KroncError(f"--keypoints {self.keypoints} with {len(folders)} scenes: expected a single scene")
-            return solve_folders(folders, self.output_dir, config)
+            return solve_folders(folders, self.output_dir, config, self.depth_weights)
         scene = load_scene(folders[0], self.keypoints)
         if self.output_dir.resolve() == folders[0].resolve():
             raise KroncError(f"--output-dir {self.output_dir} is the scene itself: choose another folder")
+        with progress_bar("estimating depths") as progress:
+            scene = with_depths(scene, folders[0], config, self.depth_weights, progress)
         claim_output(self.output_dir)
         with progress_bar("solving") as progress:
             solution = solve_scene(scene, config, progress)

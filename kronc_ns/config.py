@@ -75,7 +75,8 @@ class SolverOptions:
     min_status: MinStatus | None = None
     """completed (default): views without usable keypoints are placed between their neighbours; solved: left out."""
     depth_init: Literal["random", "prior", "prior-fixed"] | None = None
-    """Initial depths of adam: random as in the paper, or from depth maps (then optimised, or kept as they are)."""
+    """Initial depths of adam: random as in the paper, or a prior (then optimised, or kept as it is): the depth maps of
+    transforms.json, else what DINOv2 estimates from the images, scaled to the initial poses."""
     device: Literal["auto", "cpu", "cuda"] | None = None
     """Where to solve; auto takes a GPU when there is one."""
     seed: int | None = None

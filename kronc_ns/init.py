@@ -52,15 +52,22 @@ def random_depths(c2w: Float[Tensor, "n 3 4"], keypoints: int, generator: torch.
 
 
 def prior_depths(
-    given: Float[Tensor, "n j"], c2w: Float[Tensor, "n 3 4"], fallback: Float[Tensor, "n j"], metric: bool
+    given: Float[Tensor, "n j"],
+    c2w: Float[Tensor, "n 3 4"],
+    rays: Float[Tensor, "n j 3"],
+    m: Float[Tensor, "n j"],
+    fallback: Float[Tensor, "n j"],
 ) -> Float[Tensor, "n j"]:
-    """Depths from depth maps, ``fallback`` where they have none (NaN).
+    """Depths from depth maps, scaled to the initial trajectory; ``fallback`` where they have none (NaN).
 
-    Depths that are not metric (or whose trajectory is not) are scaled so that their median is 3/4 omega, the
-    middle of the paper's random range.
+    The scale is the median ratio to the depths of the points that the initial poses triangulate: one for all views,
+    since a depth map need not be metric, nor the trajectory.
     """
+    points = triangulate(c2w, rays, m)
+    initial = ((points - c2w[:, None, :, 3]) * c2w[:, None, :, 2]).sum(-1)
     known = given.isfinite()
-    scale = 1.0 if metric or not known.any() else 0.75 * mean_distance(c2w) / float(given[known].median())
+    usable = known & (m > 0) & (initial > 0)
+    scale = (initial[usable] / given[usable]).median() if usable.any() else 1.0
     return torch.where(known, given * scale, fallback)
 
 

@@ -65,3 +65,5 @@ class KroncConfig:
             raise KroncError("adam.weight_2d and adam.weight_3d must not be negative, and not both be 0")
         if self.solver == "adam" and (self.refine_focal or self.refine_k1):
             raise KroncError('refine_focal and refine_k1 need solver "lm": adam takes the intrinsics as given')
+        if self.solver == "lm" and self.depth_init != "random":
+            raise KroncError(f'depth_init {self.depth_init!r} needs solver "adam": lm has no depths to start from')

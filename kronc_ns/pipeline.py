@@ -23,6 +23,7 @@ from kronc_ns.completion import complete
 from kronc_ns.errors import KroncError
 from kronc_ns.frame import standing, template_frame
 from kronc_ns.geometry.alignment import Similarity, umeyama
+from kronc_ns.geometry.camera import rays
 from kronc_ns.init import circular_poses, prior_depths, random_depths
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.options import KroncConfig as KroncConfig
@@ -34,7 +35,7 @@ from kronc_ns.solve.threads import one_thread, turn
 from kronc_ns.starts import Start, circles, start_from_poses, start_from_template, usable_views
 from kronc_ns.verify import Evidence, verify
 
-_FORMAT = 3  # raised whenever the same input and options give another solution
+_FORMAT = 4  # raised whenever the same input and options give another solution
 _TOGETHER = 4  # scenes that go through the stages together
 _CONTRADICTED = 0.5  # of the mean distance from their middle: given centres that are off by more are no use
 _PROMISING = 2  # of the circles, those whose odd views are located anew
@@ -138,8 +139,8 @@ def _check(scene: Scene, config: KroncConfig) -> None:
             raise KroncError('init "template" needs solver "lm": adam starts from given poses or the circle')
         if config.depth_init != "random" and scene.given_depths is None:
             raise KroncError(
-                f"depth_init {config.depth_init!r} needs a depth_file_path in every frame of transforms.json: "
-                'give depth maps, or use depth_init "random"'
+                f"depth_init {config.depth_init!r} needs depths: give a depth_file_path in every frame of "
+                'transforms.json, let `kronc solve` estimate them from the images, or use depth_init "random"'
             )
 
 
@@ -228,7 +229,7 @@ def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attem
         points = torch.full((len(scene.schema), 3), math.nan, dtype=torch.float64)
         return measured(Start(name, scene, c2w, points, usable, torch.zeros_like(usable)), initial, 0, {})
     device = torch.device("cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu")
-    result = _minimise(scene, config, initial, usable, given, device, progress)
+    result = _minimise(scene, config, initial, usable, device, progress)
     c2w[usable] = result.c2w.double().cpu()
     seen = (scene.visibility * usable[:, None]).sum(0) >= 2
     points = torch.where(seen[:, None], result.points.double().cpu(), math.nan)
@@ -245,7 +246,6 @@ def _minimise(
     config: KroncConfig,
     initial: Float[Tensor, "n 3 4"],
     usable: Bool[Tensor, "n"],
-    metric: bool,
     device: torch.device,
     progress: Progress | None,
 ) -> AdamResult:
@@ -253,7 +253,7 @@ def _minimise(
     depths = random_depths(initial, len(scene.schema), generator)
     if config.depth_init != "random":
         assert scene.given_depths is not None
-        depths = prior_depths(scene.given_depths, initial, depths, metric)
+        depths = prior_depths(scene.given_depths, initial, rays(scene.uv, scene.camera), scene.visibility, depths)
     settings = replace(config.adam, optimise_depths=config.adam.optimise_depths and config.depth_init != "prior-fixed")
     camera = scene.camera
     initial, depths, uv, m = (

@@ -36,7 +36,7 @@ class Scene:
     given_c2w: Float[Tensor, "n 3 4"] | None = None
     """Poses that came with the images (OpenCV axes), for ``init="given"``."""
     given_depths: Float[Tensor, "n j"] | None = None
-    """z-depth under each keypoint from depth maps; NaN where there is none."""
+    """z-depth under each keypoint, in any unit common to all views; NaN where there is none."""
     masks: tuple[str, ...] | None = None
     """``mask_path`` of each view, or None."""
     notes: tuple[str, ...] = ()
@@ -234,14 +234,27 @@ def _given_depths(
     """Depth maps (nerfstudio's 16-bit millimetres, or .npy in metres) read under the keypoints."""
     if not all("depth_file_path" in frame for frame in frames):
         return None
-    depths = np.full(rows.shape[:2], np.nan)
-    for depth, frame, row in zip(depths, frames, rows, strict=True):
-        image = read_depth(folder / frame["depth_file_path"])
-        scale = np.array([image.shape[1] / camera.width, image.shape[0] / camera.height])
-        column, line = np.floor(row[:, :2] * scale).astype(int).T
-        inside = (row[:, 2] > 0) & (column >= 0) & (line >= 0) & (column < image.shape[1]) & (line < image.shape[0])
-        depth[inside] = image[line[inside], column[inside]]
-    return torch.from_numpy(np.where(depths > 0, depths, np.nan))
+    depths = [
+        depth_under(row, read_depth(folder / frame["depth_file_path"]), camera)
+        for frame, row in zip(frames, rows, strict=True)
+    ]
+    return torch.from_numpy(np.stack(depths))
+
+
+def depth_under(
+    row: Float[np.ndarray, "j 3"], depth_map: Float[np.ndarray, "h w"], camera: Camera
+) -> Float[np.ndarray, "j"]:
+    """Depth in the pixel of each keypoint (u, v, confidence) of one view; NaN where not seen or not above 0.
+
+    The map covers the whole image of ``camera`` at any resolution.
+    """
+    scale = np.array([depth_map.shape[1] / camera.width, depth_map.shape[0] / camera.height])
+    column, line = np.floor(row[:, :2] * scale).astype(int).T
+    inside = (column >= 0) & (line >= 0) & (column < depth_map.shape[1]) & (line < depth_map.shape[0])
+    seen = inside & (row[:, 2] > 0)
+    depth = np.zeros(len(row))
+    depth[seen] = depth_map[line[seen], column[seen]]
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
 
 
 def read_depth(path: Path) -> Float[np.ndarray, "h w"]:

@@ -24,6 +24,7 @@ with jaxtyping.install_import_hook(
         "kronc_ns.solve.solution",
         "kronc_ns.solve.uncertainty",
         "kronc_ns.keypoints",
+        "kronc_ns.capture.depth",
         "kronc_ns.capture.selection",
         "kronc_ns.capture.tone",
         "kronc_ns.capture.detection",

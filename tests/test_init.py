@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from kronc_ns.geometry.poses import compose, invert
+from kronc_ns.geometry.camera import rays
+from kronc_ns.geometry.poses import compose, invert, transform
 from kronc_ns.geometry.rotations import so3_log
 from kronc_ns.init import circular_poses, mean_distance, noisy_poses, prior_depths, random_depths
 
@@ -47,11 +48,22 @@ def test_random_depths_fill_the_papers_range_and_follow_the_seed():
     assert not torch.equal(z, random_depths(c2w, 66, torch.Generator().manual_seed(2)))
 
 
-def test_prior_depths():
-    c2w, fallback = circular_poses(2), torch.full((2, 3), 3.3, dtype=torch.float64)
-    given = torch.tensor([[10.0, math.nan, 20.0], [15.0, math.nan, 15.0]], dtype=torch.float64)
-    metric = prior_depths(given, c2w, fallback, metric=True)
-    torch.testing.assert_close(metric, torch.where(given.isnan(), fallback, given))
-    scaled = prior_depths(given, c2w, fallback, metric=False)
-    torch.testing.assert_close(scaled, torch.where(given.isnan(), fallback, given * 3.0 / 15.0))
-    torch.testing.assert_close(prior_depths(given * math.nan, c2w, fallback, metric=False), fallback)
+def test_prior_depths_are_scaled_to_the_trajectory(walk_capture):
+    """Depths in any unit come back in that of the poses, which need not be exact; unknown ones are replaced."""
+    c2w, camera = walk_capture.c2w, walk_capture.camera
+    points = torch.from_numpy(walk_capture.car.keypoints).expand(len(c2w), -1, -1)
+    true = transform(invert(c2w), points)[..., 2]
+    m = (walk_capture.keypoints[..., 2] > 0).double()
+    directions, fallback = rays(walk_capture.keypoints[..., :2], camera), torch.full_like(true, 3.3)
+    given = torch.where(m > 0, true / 7.3, math.nan)
+    found = prior_depths(given, c2w, directions, m, fallback)
+    torch.testing.assert_close(found[m > 0], true[m > 0], rtol=5e-3, atol=0)
+    assert (found[m == 0] == 3.3).all()
+    noisy = noisy_poses(c2w, 4.0, 0.5, torch.Generator().manual_seed(0))
+    found = prior_depths(given, noisy, directions, m, fallback)
+    torch.testing.assert_close(found[m > 0], true[m > 0], rtol=0.1, atol=0)
+    circle = circular_poses(len(c2w), radius_m=8.0)
+    ratio = prior_depths(given, circle, directions, m, fallback)[m > 0] / given[m > 0]
+    assert ratio.std() < 1e-9  # one factor for all
+    assert float((ratio * given[m > 0]).median()) == pytest.approx(8.0, rel=0.35)
+    torch.testing.assert_close(prior_depths(given * math.nan, c2w, directions, m, fallback), fallback)

@@ -10,6 +10,8 @@ from PIL import ExifTags, Image
 
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import Camera
+from kronc_ns.keypoints.io import read_json
+from kronc_ns.scene import camera_and_frames
 
 FULL_FRAME_DIAGONAL_MM = 43.27
 """Diagonal of 36 mm x 24 mm: what 35 mm equivalent focal lengths refer to (CIPA's convention for all aspect ratios)."""
@@ -35,9 +37,11 @@ def find_intrinsics(
     given: Camera | None = None,
     focal_length_px: float | None = None,
     fov_deg: float = 65.0,
+    given_by: str = "transforms.json",
 ) -> Intrinsics:
     """Intrinsics for images of ``size`` (width, height): the user's word first, then the file's, then EXIF.
 
+    ``given_by`` says in words where ``given`` is from.
     Where none of them says, the longer side is assumed to span ``fov_deg``. The principal point is the image
     centre unless ``given`` says otherwise.
     """
@@ -50,7 +54,7 @@ def find_intrinsics(
         camera = replace(given, fx=focal_length_px, fy=focal_length_px) if given else _centred(focal_length_px, size)
         return Intrinsics(camera, "--focal-length-px")
     if given is not None:
-        return Intrinsics(given, "transforms.json")
+        return Intrinsics(given, given_by)
     found, why_not = exif_focal_px(photos)
     if found is not None:
         return Intrinsics(_centred(found.px, size), found.source)
@@ -59,6 +63,25 @@ def find_intrinsics(
     focal = max(size) / 2 / math.tan(math.radians(fov_deg) / 2)
     reason = f" ({why_not})" if why_not else ""
     return Intrinsics(_centred(focal, size), f"assumed field of view of {fov_deg:g} deg{reason}", assumed=True)
+
+
+def read_calibration(file: Path, size: tuple[int, int]) -> Camera:
+    """The camera of a JSON file with intrinsics and distortion as in transforms.json, for images of ``size``.
+
+    A calibration of images of the same shape and another size is scaled.
+    """
+    content = read_json(file)
+    if not isinstance(content, dict):
+        raise KroncError(f"{file}: expected an object with fl_x, cx, cy, w and h, as in nerfstudio's transforms.json")
+    camera, _ = camera_and_frames({**content, "frames": [{"file_path": file.name}]}, file)
+    factor = size[0] / camera.width
+    scaled = camera if factor == 1 else camera.scaled(factor)
+    if (scaled.width, scaled.height) != size:
+        raise KroncError(
+            f"{file} is for {camera.width}x{camera.height} images, the images are {size[0]}x{size[1]}: "
+            "expected a calibration of images of the same shape, upright"
+        )
+    return scaled
 
 
 @dataclass(frozen=True)
@@ -98,11 +121,14 @@ def read_exif_focal(photo: Path) -> tuple[ExifFocal | None, str]:
     """Focal length of one photo from its EXIF, or why there is none.
 
     FocalLength with the sensor's pixel pitch (FocalPlaneXResolution), which needs the recorded image size to be
-    scaled to this file; else FocalLengthIn35mmFilm. A photo cropped after it was taken says nothing.
+    scaled to this file; else FocalLengthIn35mmFilm; else FocalLength with the sensor that COLMAP lists for the camera's
+    model. A photo cropped after it was taken says nothing.
     """
     with Image.open(photo) as image:
-        exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        general = image.getexif()
+        exif = general.get_ifd(ExifTags.IFD.Exif)
         size = image.size
+    model = str(general.get(ExifTags.Base.Model, "")).strip(" \0")
     recorded = (_number(exif.get(ExifTags.Base.ExifImageWidth)), _number(exif.get(ExifTags.Base.ExifImageHeight)))
     if min(recorded) > 0 and abs(_aspect(size) / _aspect(recorded) - 1) > _SAME_ASPECT:
         whole = f"{recorded[0]:g}x{recorded[1]:g}"
@@ -117,7 +143,30 @@ def read_exif_focal(photo: Path) -> tuple[ExifFocal | None, str]:
     film_mm = _number(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
     if film_mm > 0:
         return ExifFocal(film_mm * math.hypot(*size) / FULL_FRAME_DIAGONAL_MM, f"{film_mm:g} mm in 35 mm film"), ""
+    if focal_mm > 0:
+        known = _by_sensor_width(photo, model)
+        if known is not None:
+            return ExifFocal(known, f"{focal_mm:g} mm on the sensor of a {model}"), ""
+        return (
+            None,
+            f"EXIF says {focal_mm:g} mm, but not on what sensor, and COLMAP's list lacks the {model or 'camera'}",
+        )
     return None, "no focal length in the photos' EXIF"
+
+
+def _by_sensor_width(photo: Path, model: str) -> float | None:
+    """Focal length in px by COLMAP's list of cameras and their sensor widths, where it knows this one."""
+    import zlib  # noqa: F401  pycolmap aborts where it is loaded first
+
+    import pycolmap
+
+    if not model:
+        return None
+    try:
+        camera = pycolmap.infer_camera_from_image(str(photo))
+    except (RuntimeError, ValueError):  # a format that it does not read
+        return None
+    return float(camera.mean_focal_length()) if camera.has_prior_focal_length else None
 
 
 def _centred(focal_px: float, size: tuple[int, int]) -> Camera:

@@ -10,10 +10,11 @@ from typing import Annotated, Union
 import tyro
 from rich.console import Console
 
+from kronc_ns.capture.depth import depth_estimator, with_depths
 from kronc_ns.capture.detection.choice import DetectorOptions, find_keypoints
 from kronc_ns.capture.detection.detector import Detector
 from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, find_frames, prepare_frames
-from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics
+from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics, read_calibration
 from kronc_ns.capture.masks import find_masks, write_masks
 from kronc_ns.capture.segmentation.choice import SegmenterOptions, segment_car
 from kronc_ns.capture.segmentation.segmenter import Segmenter
@@ -57,10 +58,16 @@ class KroncToNerfstudio:
     """Frames per second taken from a video, sharp or not, instead (5 in the paper)."""
     focal_length_px: float | None = None
     """Focal length in pixels of the full-size image. Default: from transforms.json, else from EXIF."""
+    camera: Path | None = None
+    """JSON with calibrated intrinsics and distortion of images of this shape (fl_x, fl_y, cx, cy, w, h, k1, k2, p1, p2,
+    as in transforms.json)."""
     fov_deg: float = 65.0
     """Field of view across the longer side that is assumed where nothing tells the focal length."""
     num_downscales: int = 3
     """Downscaled copies: 3 makes images_2, images_4 and images_8, while the smaller side keeps 100 px."""
+    depth_weights: Path | None = None
+    """For --depth-init prior without depth maps: folder or Hugging Face name of a DINOv2 model with a DPT head (default
+    facebook/dpt-dinov2-base-kitti, downloaded)."""
     solve: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
     """How the poses are solved."""
 
@@ -77,6 +84,8 @@ class KroncToNerfstudio:
         self._check_options()
         detector, segmenter = self.detection.make(), self.segmentation.make()
         source = find_source(self.data)
+        if source.depths is None:  # what is missing is told before the work begins
+            depth_estimator(config, self.depth_weights)
         size = check_source(source)
         found = None if detector else self._read_keypoints(source)
         early = None if size is None else self._intrinsics(source, size)
@@ -111,6 +120,8 @@ class KroncToNerfstudio:
         scene = load_scene(out)
         if intrinsics.assumed and config.solver == "lm":
             config = replace(config, refine_focal=True)
+        with progress_bar("estimating depths") as progress:
+            scene = with_depths(scene, out, config, self.depth_weights, progress)
         with progress_bar("solving") as progress:
             solution = solve_scene(scene, config, progress)
         report = write_solution(out, scene, solution, out, fingerprint(scene, config))
@@ -162,7 +173,10 @@ class KroncToNerfstudio:
         return None
 
     def _intrinsics(self, source: Source, size: tuple[int, int]) -> Intrinsics:
-        return find_intrinsics(size, source.images, source.camera, self.focal_length_px, self.fov_deg)
+        given, given_by = source.camera, "transforms.json"
+        if self.camera is not None:
+            given, given_by = read_calibration(self.camera, size), str(self.camera)
+        return find_intrinsics(size, source.images, given, self.focal_length_px, self.fov_deg, given_by)
 
     def _write_masks(
         self, segmenter: Segmenter | None, source: Source, frames: Frames
@@ -226,7 +240,7 @@ def _covers(names: tuple[str, ...], found: Detections) -> bool:
 def _assumption(intrinsics: Intrinsics) -> str:
     return (
         f"warning: focal length {intrinsics.camera.fx:.0f} px is an {intrinsics.source}; "
-        "give --focal-length-px or a calibrated transforms.json for exact poses"
+        "give --focal-length-px or --camera for exact poses"
     )
 
 

@@ -1,5 +1,6 @@
 """The focal length is never guessed silently: its origin is told, and an assumption is marked."""
 
+import json
 import math
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
-from kronc_ns.capture.intrinsics import FULL_FRAME_DIAGONAL_MM, find_intrinsics
+from kronc_ns.capture.intrinsics import FULL_FRAME_DIAGONAL_MM, find_intrinsics, read_calibration
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import Camera
 
@@ -76,6 +77,39 @@ def test_sensor_pitch_needs_the_recorded_size(tmp_path: Path):
         FocalPlaneResolutionUnit=4,
     )
     assert find_intrinsics(SIZE, [photo]).assumed
+
+
+def test_colmaps_list_of_sensors_is_the_last_word(tmp_path: Path):
+    def photo(name: str, make: str, model: str) -> Path:
+        exif = Image.Exif()
+        exif[Tag.Make], exif[Tag.Model] = make, model
+        exif.get_ifd(ExifTags.IFD.Exif)[Tag.FocalLength] = IFDRational(35, 1)
+        Image.new("RGB", SIZE).save(tmp_path / name, exif=exif)
+        return tmp_path / name
+
+    found = find_intrinsics(SIZE, [photo("a.jpg", "Canon", "Canon EOS 5D Mark II")])
+    assert found.camera.fx == pytest.approx(35 / 36 * SIZE[0], rel=0.01)
+    assert found.source == "EXIF: 35 mm on the sensor of a Canon EOS 5D Mark II"
+    unknown = find_intrinsics(SIZE, [photo("b.jpg", "Nobody", "Pinhole 1")])
+    assert unknown.assumed
+    assert "EXIF says 35 mm, but not on what sensor, and COLMAP's list lacks the Pinhole 1" in unknown.source
+
+
+def test_a_calibration_of_the_same_shape_is_scaled(tmp_path: Path):
+    file = tmp_path / "camera.json"
+    content = {"fl_x": 1000.0, "fl_y": 1010.0, "cx": 590.0, "cy": 410.0, "w": 1200, "h": 800, "k1": 0.1, "k2": -0.02}
+    file.write_text(json.dumps(content))
+    assert read_calibration(file, SIZE) == Camera(500.0, 505.0, 295.0, 205.0, *SIZE, k1=0.1, k2=-0.02)
+    found = find_intrinsics(SIZE, given=read_calibration(file, SIZE), given_by=str(file))
+    assert (found.source, found.assumed, found.camera.k2) == (str(file), False, -0.02)
+    with pytest.raises(KroncError, match=r"camera\.json is for 1200x800 images, the images are 400x600"):
+        read_calibration(file, (400, 600))
+    file.write_text(json.dumps({"fl_x": 1000.0}))
+    with pytest.raises(KroncError, match=r"camera\.json: cx, cy, w, h missing"):
+        read_calibration(file, SIZE)
+    file.write_text("[]")
+    with pytest.raises(KroncError, match="expected an object with fl_x"):
+        read_calibration(file, SIZE)
 
 
 def test_a_cropped_photo_says_nothing(tmp_path: Path):
