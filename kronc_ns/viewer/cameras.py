@@ -12,7 +12,7 @@ from torch import Tensor
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.rotations import quaternion_from_rotation
 from kronc_ns.stages import frustum_depth, known
-from kronc_ns.viewer.colours import SELECTED
+from kronc_ns.viewer.colours import SELECTED, Colour
 
 if TYPE_CHECKING:
     import viser
@@ -62,7 +62,8 @@ class Cameras:
         """Show other colours."""
         with self._lock:
             self._colours = colours
-            self._draw_all()
+            for i in self._handles:
+                self._colour(i)
 
     def set_thumbnail(self, i: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Put an image into a frustum."""
@@ -82,21 +83,32 @@ class Cameras:
         with self._lock:
             before, self._selected = self._selected, i
             for j in {before, i} & set(self._handles):
-                self._draw(j)
+                self._colour(j)
 
     def _draw_all(self) -> None:
         for i in self.views:
             self._draw(i)
 
+    def _colour_of(self, i: int) -> Colour:
+        red, green, blue = self._colours[i].tolist()
+        return SELECTED if i == self._selected else (red, green, blue)
+
+    def _colour(self, i: int) -> None:
+        """Give the frustum its colour; viser 0.2 can only draw it anew, with its image."""
+        if hasattr(self._handles[i], "color"):
+            setattr(self._handles[i], "color", self._colour_of(i))  # noqa: B010 (pyright knows 0.2 only)
+        else:
+            self._draw(i)
+
     def _draw(self, i: int) -> None:
-        """Add the frustum anew: viser 0.2 cannot change colour or image of one that is there."""
+        """Add the frustum, in place of the one that is there."""
         turn, centre = self.pose(i)
         handle = self._server.scene.add_camera_frustum(
             f"/cameras/{i + 1:04d}",
             fov=self._fov,
             aspect=self._aspect,
             scale=self._scale,
-            color=SELECTED if i == self._selected else tuple(self._colours[i].tolist()),
+            color=self._colour_of(i),
             image=self._thumbnails.get(i) if self._with_images else None,
             wxyz=turn,
             position=centre,

@@ -1,5 +1,7 @@
 """The viewer: what is shown, and the panel beside it that changes it."""
 
+import contextlib
+import io
 import string
 import threading
 from pathlib import Path
@@ -21,7 +23,7 @@ from kronc_ns.viewer.car import Car
 if TYPE_CHECKING:
     import viser
 
-_THUMBNAIL_PX = 160
+_THUMBNAIL_PX = 120
 _PLAY_S, _FRAMES = 3.0, 60
 _BLANK = np.full((9, 16, 3), 160, np.uint8)
 """In place of an image that is not found: without a surface a camera can hardly be clicked."""
@@ -54,7 +56,8 @@ class Viewer:
         """End the server and what runs beside it."""
         self._closed.set()
         self._loader.join()  # a thread inside of a library when Python ends aborts the process
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # what later viser says then
+            self.server.stop()
 
     def select(self, i: int) -> None:
         """Mark view ``i`` (from 0), draw its rays, and show its image and figures in the panel."""

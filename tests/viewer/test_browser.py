@@ -21,6 +21,8 @@ from tests.viewer.test_viewer import free_port
 pytest.importorskip("viser", reason="viser is not installed: pip install 'kronc-ns[viewer]'")
 pytestmark = pytest.mark.slow
 
+SCENE = "canvas[data-engine]"
+"""Where three.js draws, and nothing of the panel."""
 OF_VISER_ITSELF = ("ERR_NAME_NOT_RESOLVED", "computeBoundingSphere(): Computed radius is NaN")
 """What viser 0.2.7's page says of any scene with a grid, and of an analytics script that is out of reach."""
 
@@ -60,30 +62,37 @@ def until(page, reached: Callable[[], object]) -> None:
 
 
 def pixels(page) -> np.ndarray:
-    shot = page.locator("canvas").first.screenshot()
+    """The scene, which lies left of the panel."""
+    shot = page.screenshot(clip={"x": 0, "y": 0, "width": 600, "height": 640})
     return cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> float:
-    """Share of the pixels that differ; blurred, for viser draws coarser pixels when the machine is busy."""
-    first, second = (cv2.blur(shot.astype(np.float32), (9, 9)) for shot in (before, after))
-    return float((np.abs(first - second).max(-1) > 20).mean())
+    """Share of the pixels that differ; blurred, for lines are thin."""
+    first, second = (cv2.blur(shot.astype(np.float32), (21, 21)) for shot in (before, after))
+    return float((np.abs(first - second).max(-1) > 10).mean())
 
 
 def still(page) -> bool:
     """Whether the scene is drawn and changes no more."""
     before = pixels(page)
     page.wait_for_timeout(1000)
-    return bool(np.ptp(before) > 100 and changed(before, pixels(page)) < 1e-3)
+    return bool(np.ptp(before) > 100 and changed(before, pixels(page)) < 5e-3)
 
 
-def near(shot: np.ndarray, colour: tuple[int, int, int]) -> float:
-    return float((np.abs(shot - np.array(colour)).max(-1) < 40).mean())
+def share_of(shot: np.ndarray, colour: tuple[int, int, int]) -> float:
+    """Share of the pixels that have a colour's hue, which thin lines keep where they are mixed with white."""
+
+    def hsv(rgb: np.ndarray) -> np.ndarray:
+        return cv2.cvtColor(rgb.astype(np.uint8), cv2.COLOR_RGB2HSV).astype(int)
+
+    seen, wanted = hsv(shot), hsv(np.array([[colour]]))[0, 0]
+    return float(((np.abs(seen[..., 0] - wanted[0]) < 7) & (seen[..., 1] > 25)).mean())
 
 
 def on_canvas(page, client, point: np.ndarray) -> tuple[float, float]:
     """Where a point of the world is seen, in pixels of the page."""
-    box, camera = page.locator("canvas").first.bounding_box(), client.camera
+    box, camera = page.locator(SCENE).bounding_box(), client.camera
     w, x, y, z = camera.wxyz
     turn = np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -106,7 +115,7 @@ def test_cameras_car_and_rays_are_drawn(page):
         "right side": (213, 94, 0),
         "selected": (204, 121, 167),
     }.items():
-        assert near(shot, colour) > 1e-4, what
+        assert share_of(shot, colour) > 1e-4, what
 
 
 def test_the_panel_shows_the_overlay_of_the_selected_view(page, viewer, solved_lap_folder):
@@ -120,29 +129,37 @@ def test_the_panel_shows_the_overlay_of_the_selected_view(page, viewer, solved_l
 
 
 def test_the_slider_moves_the_cameras(page, viewer, solved_lap_folder):
+    """To their start, to their end, and to the start again."""
     _, solution = read_solution(solved_lap_folder)
-    after = pixels(page)
-    slider = page.get_by_role("slider").first
-    slider.press("Home")
     start = aligned_start(solution)
     moving = [i for i in viewer.cameras.views if start[i].isfinite().all()]
-    until(page, lambda: np.allclose(viewer.cameras.pose(moving[0])[1], start[moving[0], :, 3]))
-    np.testing.assert_allclose(
-        np.stack([viewer.cameras.pose(i)[0] for i in moving]), quaternion_from_rotation(start[moving][..., :3])
-    )
-    until(page, lambda: still(page))
-    moved = changed(after, pixels(page))
-    assert moved > 0.005
-    slider.press("End")
-    until(page, lambda: np.allclose(viewer.cameras.pose(moving[0])[1], solution.c2w[moving[0], :, 3]))
-    until(page, lambda: still(page))
-    assert changed(after, pixels(page)) < 0.2 * moved
+    slider = page.get_by_role("slider").first
+
+    def seen_at(key: str, c2w: torch.Tensor) -> tuple[int, np.ndarray]:
+        slider.press(key)
+        until(page, lambda: np.allclose(viewer.cameras.pose(moving[0])[1], c2w[moving[0], :, 3]))
+        for i in moving:
+            turn = quaternion_from_rotation(c2w[i, :, :3])
+            np.testing.assert_allclose(viewer.cameras.pose(i)[0], turn, atol=1e-5)  # written to six digits
+        until(page, lambda: still(page))
+        return page.evaluate(f"document.querySelector('{SCENE}').width"), pixels(page)
+
+    end = time.monotonic() + BROWSER_PATIENCE_MS / 1000
+    while True:
+        shots = [seen_at(*at) for at in (("Home", start), ("End", solution.c2w), ("Home", start))]
+        if len({width for width, _ in shots}) == 1:  # viser draws coarser and finer as the machine is more or less busy
+            break
+        assert time.monotonic() < end, "never thrice at the same resolution"
+    (_, before), (_, after), (_, again) = shots
+    assert changed(before, after) > 0.02
+    assert changed(before, again) < 0.2 * changed(before, after)
 
 
 def test_a_click_on_a_camera_selects_it(page, viewer, solved_lap_folder):
     _, solution = read_solution(solved_lap_folder)
+    viewer.show(1.0)
     (client,) = viewer.server.get_clients().values()
-    canvas = page.locator("canvas").first.bounding_box()
+    canvas = page.locator(SCENE).bounding_box()
     ahead = frustum_depth(solution.c2w) * solution.c2w[..., 2]
     at = {i: on_canvas(page, client, (solution.c2w[i, :, 3] + ahead[i]).numpy()) for i in viewer.cameras.views}
     inside = [i for i, (x, y) in at.items() if 30 < x < canvas["width"] - 30 and 30 < y < canvas["height"] - 30]
@@ -164,8 +181,8 @@ def test_a_click_on_a_camera_selects_it(page, viewer, solved_lap_folder):
 
 def test_colours_follow_the_residual(page, viewer):
     before = pixels(page)
-    page.locator("input[value='status']").click()
+    page.locator("input[value='status']:not([type=hidden])").click()
     page.get_by_role("option", name="residual").click()
     until(page, lambda: any("RMSE of a view" in unquote(i.get_attribute("src")) for i in page.locator("img").all()))
-    until(page, lambda: still(page))
-    assert near(pixels(page), (0, 114, 178)) < near(before, (0, 114, 178))
+    yellow = (210, 190, 100)  # of poor views; no status has it
+    until(page, lambda: share_of(pixels(page), yellow) > share_of(before, yellow) + 1e-4)
