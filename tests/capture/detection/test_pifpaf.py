@@ -247,8 +247,10 @@ def test_a_conversion_that_fails_leaves_nothing(tmp_path: Path, fake):
 
 
 TERMINATED = """
+import signal
 import sys
 from pathlib import Path
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs ignore
 from kronc_ns.capture.detection.detector import CarImage
 from kronc_ns.capture.detection.pifpaf import OpenPifPafDetector
 from kronc_ns.console import exit_on_error
@@ -268,7 +270,10 @@ def test_a_child_ends_when_we_are_told_to(tmp_path: Path, fake, sent: signal.Sig
             assert parent.poll() is None
             time.sleep(0.01)
         parent.send_signal(sent)
-        _, said = parent.communicate(timeout=120)
+        try:
+            _, said = parent.communicate(timeout=60)
+        finally:
+            parent.kill()
     assert parent.returncode == status
     assert len(said.splitlines()) == 1
     with pytest.raises(ProcessLookupError):
