@@ -151,10 +151,18 @@ def test_ctrl_c_ends_the_command_quietly(solved_lap_folder):
     command = [sys.executable, "-m", "kronc_ns.cli", "view", "--data", str(solved_lap_folder), "--port", str(port)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # which a shell's background jobs ignore
     ) as running:
-        assert running.stdout is not None
-        assert f"http://localhost:{port}" in running.stdout.readline()
-        running.send_signal(signal.SIGINT)
-        out, err = running.communicate(timeout=60)
+        try:
+            assert running.stdout is not None
+            assert f"http://localhost:{port}" in running.stdout.readline()
+            running.send_signal(signal.SIGINT)
+            out, err = running.communicate(timeout=60)
+        finally:
+            running.kill()
     assert (running.returncode, out, err) == (0, "", "")
