@@ -15,22 +15,20 @@ SHORT = {
     "kronc-tensorf-cpu": ["--max-num-iterations", "300", *RAYS],
     "kronc-dvgo-cpu": ["--max-num-iterations", "400", *RAYS],
 }
-KINDS = ("exact poses", "1 px at 400x400", "not solved")
+KINDS = ("exact poses", "1 px at 400x400")  # two trainings side by side; unsolved poses: test_training, test_fields
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_solved_poses_train_like_exact_ones_and_unsolved_ones_do_not(method, tmp_path):
+def test_solved_poses_train_like_exact_ones(method, tmp_path):
     with Commands({"OMP_NUM_THREADS": "1", "KRONC_NS_CACHE": str(tmp_path / "cache")}) as commands:
         tasks = nvs_tasks(Trainings(tmp_path, commands, views=50, width=64, options=SHORT[method]))
         chosen = [task for task in tasks if method in task.name and task.name.endswith(KINDS)]
         rows = list(measure_rows(chosen, first_seed=7, workers=2))
     assert not any(row.failures for row in rows), [row.failures for row in rows]
-    exact, solved, unsolved = (row.reached for row in rows)
-    print(f"{method}: {exact}, {solved}, {unsolved}")
-    assert solved["rotation_deg"] < 0.5 < 3 < unsolved["rotation_deg"]
+    exact, solved = (row.reached for row in rows)
+    print(f"{method}: {exact}, {solved}")
+    assert 0 < solved["rotation_deg"] < 0.5
     assert solved["psnr_below_exact"] == pytest.approx(exact["psnr"] - solved["psnr"])
     assert solved["psnr_below_exact"] < 1.5
-    assert unsolved["psnr_below_exact"] > solved["psnr_below_exact"] + 2
-    assert unsolved["vehicle_psnr_below_exact"] > solved["vehicle_psnr_below_exact"] + 2
     pictures = sorted((tmp_path / "seed_7" / "pictures" / method / "exact").iterdir())
     assert len(pictures) == 10
