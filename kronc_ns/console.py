@@ -47,7 +47,7 @@ def exit_on_error() -> Iterator[None]:
 
 def _terminate(*_: object) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: let the children be ended
-    sys.exit(_fail("terminated; the same command goes on where it stopped", 143))
+    sys.exit(_fail("terminated; the same command starts again", 143))
 
 
 def exit_status(report: Mapping[str, Any]) -> int:

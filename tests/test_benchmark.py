@@ -17,7 +17,6 @@ from kronc_ns import cli
 from kronc_ns.benchmark import paper
 from kronc_ns.benchmark.baselines import bundle_adjustment, triangulate
 from kronc_ns.benchmark.commands import Commands
-from kronc_ns.benchmark.likelihood import maximum_likelihood
 from kronc_ns.benchmark.nvs_measures import Trainings, judge_exact, judge_solved
 from kronc_ns.benchmark.nvs_rows import METHODS, nvs_tasks
 from kronc_ns.benchmark.pose_rows import pose_tasks
@@ -32,6 +31,7 @@ from kronc_ns.init import noisy_poses
 from kronc_ns.pipeline import KroncConfig, solve_scene
 from kronc_ns.synthetic.scenes import make_capture
 from kronc_ns.synthetic.variations import empty_views
+from tests.likelihood import maximum_likelihood
 
 
 def start(capture, degrees=4.0, metres=0.5):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ import tyro
 
 from kronc_ns.benchmark import settings
 from kronc_ns.benchmark.colmap import map_images, map_keypoints
+from kronc_ns.benchmark.memory import with_peak
 from kronc_ns.benchmark.peers import Placed, figures, place
 from kronc_ns.benchmark.subjects import from_folder, procedural, thinned, with_noise
 from kronc_ns.benchmark.tables import Setting, TableOptions, make_table, markdown
@@ -102,7 +104,17 @@ def test_every_method_places_the_views_of_a_noisy_start_in_a_process_of_its_own(
     assert found["registered"] > 0.8
     assert found["median_deg"] < 0.05
     assert found["seconds"] > 0
-    assert found["megabytes"] > 0 or math.isnan(found["megabytes"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peak memory is counted on Linux")
+def test_peak_memory_is_what_a_run_adds_however_often_it_ran_before():
+    def run() -> int:
+        return torch.ones(40 * 2**20 // 8, dtype=torch.float64).numel()
+
+    for _ in range(2):
+        numel, megabytes = with_peak(run)
+        assert numel == 5 * 2**20
+        assert 39 < megabytes < 48
 
 
 @pytest.mark.slow

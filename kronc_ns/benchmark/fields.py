@@ -14,14 +14,13 @@ from torch import Tensor
 from kronc_ns.benchmark.commands import Commands
 from kronc_ns.benchmark.peers import Method, Placed, figures, place
 from kronc_ns.benchmark.rows import hardware, plain
+from kronc_ns.benchmark.settings import ADAM_FROM_CIRCLE
 from kronc_ns.benchmark.subjects import Subject, from_folder
 from kronc_ns.benchmark.training import train, write_poses
 from kronc_ns.errors import KroncError
 from kronc_ns.files import atomic_path, write_json
 from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.init import circular_poses
-from kronc_ns.options import KroncConfig
-from kronc_ns.solve.adam import AdamConfig
 
 PosesOf = Method | Literal["reference", "circle"]
 _PAPER = {
@@ -47,8 +46,6 @@ class FieldOptions:
     """Method of `ns-train`."""
     backgrounds: tuple[Literal["keep", "white"], ...] = ("keep", "white")
     """keep: trained and tested on the full frame; white: on the vehicle, cut out."""
-    radius_m: float = 4.0
-    """Radius of the circle."""
     iterations: int | None = None
     """Training steps (default: the method's)."""
 
@@ -82,7 +79,7 @@ def make_field_table(options: FieldOptions) -> None:
 
 
 def _row(subject: Subject, poses: PosesOf, options: FieldOptions, commands: Commands) -> dict[str, Any]:
-    c2w, errors = _poses(subject, poses, options)
+    c2w, errors = _poses(subject, poses)
     data = options.output_dir / subject.name / poses
     assert subject.folder is not None
     write_poses(data, subject.folder, subject.scene, c2w, subject.points)
@@ -100,15 +97,15 @@ def _row(subject: Subject, poses: PosesOf, options: FieldOptions, commands: Comm
     return {"capture": subject.name, "poses": poses, "errors": errors, "results": results, "cells": cells}
 
 
-def _poses(subject: Subject, poses: PosesOf, options: FieldOptions) -> tuple[Float[Tensor, "n 3 4"], dict[str, float]]:
+def _poses(subject: Subject, poses: PosesOf) -> tuple[Float[Tensor, "n 3 4"], dict[str, float]]:
     """Poses in the frame of the reference, and their errors."""
     if poses == "reference":
         c2w = subject.truth
     elif poses == "circle":
-        c2w = circular_poses(len(subject.truth), options.radius_m, "ccw", 1.0)
+        circle = ADAM_FROM_CIRCLE
+        c2w = circular_poses(len(subject.truth), circle.radius_m, circle.direction, circle.laps)
     else:
-        circle = KroncConfig(init="circular", radius_m=options.radius_m, adam=AdamConfig(learning_rate=0.01))
-        c2w = place(poses, subject, None, circle if poses == "adam" else None).c2w
+        c2w = place(poses, subject, None, ADAM_FROM_CIRCLE if poses == "adam" else None).c2w
     posed = c2w.isfinite().all(-1).all(-1)
     if int(posed.sum()) < 3:
         raise KroncError(f"{poses} places {int(posed.sum())} views of {subject.name}: nothing to train on")

@@ -1,7 +1,5 @@
 """What the paper reports, to stand beside what is measured: errors in (degrees, centimetres)."""
 
-BARF = (7.67, 49.38)
-"""From (4 deg, 0.5 m), a field that refines poses itself."""
 BY_NOISE = {
     (4.0, 0.5): (0.65, 3.06),
     (5.0, 0.7): (0.75, 3.07),

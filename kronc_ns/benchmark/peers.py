@@ -17,6 +17,7 @@ from typing_extensions import assert_never
 
 from kronc_ns.benchmark.baselines import bundle_adjustment
 from kronc_ns.benchmark.colmap import map_images, map_keypoints
+from kronc_ns.benchmark.memory import with_peak
 from kronc_ns.benchmark.subjects import Subject
 from kronc_ns.errors import KroncError
 from kronc_ns.evaluate import AUC_LIMITS_DEG, evaluate_poses
@@ -109,28 +110,13 @@ def _measured(run: Callable[[], Tensor], again: bool) -> Placed:
     """In the other process: poses, time and memory."""
     if again:
         run()
-    base = _forget_peak()
-    begin = time.perf_counter()
-    c2w = run()
-    return Placed(c2w, time.perf_counter() - begin, _memory("VmHWM") - base)
 
+    def timed() -> tuple[Tensor, float]:
+        begin = time.perf_counter()
+        return run(), time.perf_counter() - begin
 
-def _forget_peak() -> float:
-    """Let the peak of this process begin anew at what it has now, in megabytes (Linux; elsewhere NaN)."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return math.nan
-    return _memory("VmRSS")
-
-
-def _memory(field: str) -> float:
-    """A field of /proc/self/status in megabytes; NaN where there is none."""
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return math.nan
-    return next((float(line.split()[1]) / 1024 for line in lines if line.startswith(field)), math.nan)
+    (c2w, seconds), megabytes = with_peak(timed)
+    return Placed(c2w, seconds, megabytes)
 
 
 def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfig | None) -> Float[Tensor, "n 3 4"]:
@@ -141,8 +127,10 @@ def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfi
             solution = solve_scene(scene, replace(config, solver=solver, min_status="solved"))
             return solution.c2w
         case "ceres":
+            circle = KroncConfig()
             start = scene.given_c2w
-            start = circular_poses(len(scene), KroncConfig().radius_m, "ccw", 1.0) if start is None else start
+            if start is None:
+                start = circular_poses(len(scene), circle.radius_m, circle.direction, circle.laps)
             return bundle_adjustment(scene, start, loss="cauchy").c2w
         case "colmap-incremental" | "colmap-global" | "colmap-incremental-masked" | "colmap-global-masked":
             if folder is None:

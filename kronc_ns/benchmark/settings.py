@@ -12,7 +12,8 @@ from kronc_ns.solve.adam import AdamConfig
 
 # The paper's rate for synthetic scenes; with that for real ones (0.001) cameras do not get off the circle far enough.
 _ADAM = KroncConfig(solver="adam", adam=AdamConfig(learning_rate=0.01))
-_ADAM_FROM_CIRCLE = replace(_ADAM, init="circular")
+ADAM_FROM_CIRCLE = replace(_ADAM, init="circular")
+"""The paper's solver from its circle."""
 _SUBSETS = (1.0, 0.75, 0.5, 0.25, 0.1)
 _PRIOR_NOISE = 0.1
 _ON_KEYPOINTS: tuple[Method, ...] = ("kronc", "adam", "keypoints-incremental", "keypoints-global")
@@ -88,7 +89,7 @@ def by_depths(options: TableOptions) -> list[Setting]:
     rows = []
     for noise_px in options.noise_px:
         for depth_init in ("random", "prior", "prior-fixed"):
-            config = replace(_ADAM_FROM_CIRCLE, depth_init=depth_init)
+            config = replace(ADAM_FROM_CIRCLE, depth_init=depth_init)
             of_paper = {"paper, PSNR": f"{paper.PSNR_BY_DEPTHS[depth_init]} dB"}
             row = _solved({"depths": depth_init}, "adam", noise_px, start=None, config=config, paper=of_paper)
             rows.append(replace(row, depth_noise=None if depth_init == "random" else _PRIOR_NOISE))
@@ -102,7 +103,7 @@ def by_subset(options: TableOptions) -> list[Setting]:
         label, subset = {"images": f"{100 * share:.0f} %"}, partial(_share, share)
         for noise_px in options.noise_px:
             for method in _ON_KEYPOINTS:
-                config = _ADAM_FROM_CIRCLE if method == "adam" else None
+                config = ADAM_FROM_CIRCLE if method == "adam" else None
                 rows.append(_solved(label, method, noise_px, None, config, subset))
         rows += [_solved(label, method, 0.0, None, None, subset) for method in _ON_IMAGES]
     return rows

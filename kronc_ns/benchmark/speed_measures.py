@@ -1,17 +1,16 @@
 """What the rows of speed measure on one seed, and how the seeds are judged."""
 
 import math
-import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 from statistics import median
 
 import torch
 
 from kronc_ns.adjustment import shape_prior
 from kronc_ns.benchmark.baselines import LinearSolver, bundle_adjustment
+from kronc_ns.benchmark.memory import with_peak
 from kronc_ns.benchmark.pose_measures import USUAL_START, Verdict
 from kronc_ns.benchmark.problems import Shapes, capture_shape, noisy_start, solution_figures
 from kronc_ns.benchmark.rows import Figures, Runs
@@ -189,31 +188,17 @@ def judge_growth(runs: Runs) -> Verdict:
 
 def measure_peak(seed: int, views: int) -> float:
     """Megabytes by which solving a capture raises this process' resident memory at its peak (Linux only, else NaN)."""
-    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     small, start = _posed_capture(seed, 12)
     solve_scene(capture_scene(small, start), _DEFAULT)  # what is loaded once is no cost of a view
     scene = capture_scene(*_posed_capture(seed, views))
-
-    def resident(which: str) -> float:
-        line = next(line for line in status.read_text().splitlines() if line.startswith(which))
-        return int(line.split()[1]) / 1024
-
-    try:
-        reset.write_text("5")  # the peak starts from now
-        before = resident("VmRSS")
-        solve_scene(scene, _DEFAULT)
-        return resident("VmHWM") - before
-    except (OSError, StopIteration):
-        return math.nan
+    return with_peak(lambda: solve_scene(scene, _DEFAULT))[1]
 
 
 def _peak_megabytes(seed: int, views: int) -> float:
     module = "kronc_ns.benchmark.speed_measures"
     code = f"from {module} import measure_peak; print(measure_peak({seed}, {views}))"
-    # the allocator would otherwise keep freed memory and hand it out again unseen
-    environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0"}
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise KroncError(f"measuring the memory failed: {done.stderr.strip().splitlines()[-1:]}")
     return float(done.stdout.split()[-1])

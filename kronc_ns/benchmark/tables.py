@@ -31,8 +31,8 @@ class TableOptions:
     cars: int = 5
     """Number of procedural cars."""
     noise_px: tuple[float, ...] = (0.0, 1.0)
-    """Noise of the keypoints: standard deviation along each axis, in pixels of the capture. What comes with a folder
-    as measured keypoints is taken as it is with 0."""
+    """Noise added to the keypoints: standard deviation along each axis, in pixels of the capture (0 for keypoints that
+    were measured)."""
     methods: tuple[Method, ...] = ()
     """Only rows of these methods; default: all that the table has."""
     first_seed: int = 0

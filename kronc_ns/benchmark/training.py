@@ -1,27 +1,20 @@
 """Are the poses good enough to train on? The same training on solved, exact and unoptimised poses."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from kronc_ns.benchmark.commands import Commands
-from kronc_ns.capture.images import load_image, write_downscales
-from kronc_ns.capture.masks import downscale_mask
 from kronc_ns.export import claim_output, write_solution
-from kronc_ns.geometry.alignment import umeyama
-from kronc_ns.init import circular_poses
 from kronc_ns.pipeline import KroncConfig, solve_scene
 from kronc_ns.scene import Scene, load_scene, read_poses
 from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
 
-Poses = Literal["exact", "solved", "given", "circle"]
+Poses = Literal["exact", "solved", "given"]
 
 
 def write_variant(
@@ -35,8 +28,7 @@ def write_variant(
     """A data set of the rendered capture ``data`` with one kind of poses, ready for `kronc-dataparser`.
 
     ``points`` are the true keypoints in the world of reference.json. ``keypoints`` is a file to solve from instead of
-    the capture's. Unoptimised poses are those of transforms.json, or the circle, brought as near to the truth as a
-    similarity can, so that the car lies in its scene box.
+    the capture's. Given poses are those of transforms.json, not optimised.
     """
     found = keypoints or data / "keypoints.json"
     scene = load_scene(data, found)
@@ -45,13 +37,10 @@ def write_variant(
         write_solution(folder, scene, solve_scene(scene, config), data, inputs=which)
         return
     reference = read_poses(data / "reference.json")
-    c2w = truth = torch.stack([reference[name] for name in scene.names])
+    c2w = torch.stack([reference[name] for name in scene.names])
     if which == "given":
         assert scene.given_c2w is not None
         c2w = scene.given_c2w
-    elif which == "circle":
-        circle = circular_poses(len(scene), config.radius_m, config.direction, config.laps)
-        c2w = umeyama(circle[..., 3], truth[..., 3]).apply_to_poses(circle)
     write_poses(folder, data, scene, c2w, points)
 
 
@@ -88,16 +77,6 @@ def write_poses(
     write_solution(folder, scene, solution, data, inputs="poses from elsewhere")
 
 
-def add_half_size(data: Path) -> None:
-    """Write images_2 and masks_2 of a scene folder, as `ns-process-data kronc` does."""
-    for image in sorted((data / "images").iterdir()):
-        write_downscales(load_image(image), image, (2,))
-    (data / "masks_2").mkdir(exist_ok=True)
-    for mask in sorted((data / "masks").iterdir()):
-        half = downscale_mask(np.asarray(load_image(mask)), 2)
-        Image.fromarray(half).save(data / "masks_2" / mask.name)
-
-
 def train(
     data: Path,
     method: str,
@@ -110,16 +89,3 @@ def train(
     arguments = ["--data", str(data), "--output-dir", str(out), "--experiment-name", data.name, "--timestamp", "run"]
     (commands or Commands()).run("ns-train", method, *arguments, *options, "kronc-dataparser", *parser)
     return out / data.name / method / "run" / "config.yml"
-
-
-def evaluate(config: Path, renders: Path | None = None) -> dict[str, Any]:
-    """`ns-eval` of a run: mean PSNR, SSIM and LPIPS (nan where its weights are missing) over the test views."""
-    output = config.parent / "eval.json"
-    images = ["--render-output-path", str(renders)] if renders is not None else []
-    run("ns-eval", "--load-config", str(config), "--output-path", str(output), *images)
-    return json.loads(output.read_text())["results"]
-
-
-def run(command: str, *arguments: str) -> str:
-    """Run one of nerfstudio's commands of this environment; its output, or an error that ends with it."""
-    return Commands().run(command, *arguments)

@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 
 from kronc_ns.capture.detection.model import file_sha256
 from kronc_ns.capture.detection.pixels import read_rgb
+from kronc_ns.capture.pretrained import load_pretrained, transformers_for
 from kronc_ns.capture.source import Count
 from kronc_ns.errors import KroncError
 from kronc_ns.files import atomic_path, cache_folder
@@ -41,30 +42,14 @@ class DinoDepth:
     """DINOv2 and DPT through transformers."""
 
     def __init__(self, weights: Path | None) -> None:
-        try:
-            from transformers import AutoImageProcessor, AutoModelForDepthEstimation
-        except ImportError:
-            raise KroncError(
-                "--depth-init prior needs transformers, which is not installed: pip install 'kronc-ns[depth]'; "
-                "or give a depth_file_path in every frame of transforms.json"
-            ) from None
-        name = str(weights or MODEL)
-        try:
-            self._processor: Any = AutoImageProcessor.from_pretrained(name)
-            model: Any = AutoModelForDepthEstimation.from_pretrained(name)
-        except (OSError, ValueError) as error:
-            raise KroncError(
-                f"{name} cannot be loaded ({str(error).strip().splitlines()[0]}): give as --depth-weights a folder "
-                f"with what `hf download {MODEL} --local-dir FOLDER` fetches"
-            ) from None
-        self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self._model = model.eval().to(self._device)
-        self._name = _identity(Path(name), getattr(model.config, "_commit_hash", None))
+        transformers = transformers_for("--depth-init prior without depth maps", "depth")
+        model_class = transformers.AutoModelForDepthEstimation
+        self._network = load_pretrained(model_class, weights, MODEL, "--depth-weights")
 
     @property
     def identity(self) -> str:
         """Model, its revision or content, and resolution."""
-        return f"depth {self._name} {_LONG_SIDE}"
+        return f"depth {self._network.name} {_LONG_SIDE}"
 
     @torch.inference_mode()
     def estimate(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w2"]:
@@ -73,8 +58,9 @@ class DinoDepth:
         height, width = (max(1, round(side * factor / _PATCH)) * _PATCH for side in rgb.shape[:2])
         whole = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
         # the processor's own padding would have to be cut off again
-        inputs = self._processor(images=whole, do_resize=False, do_pad=False, return_tensors="pt").to(self._device)
-        return self._model(**inputs).predicted_depth[0].float().cpu().numpy()
+        network = self._network
+        inputs = network.processor(images=whole, do_resize=False, do_pad=False, return_tensors="pt").to(network.device)
+        return network.model(**inputs).predicted_depth[0].float().cpu().numpy()
 
 
 def depth_estimator(config: KroncConfig, weights: Path | None) -> DepthEstimator | None:
@@ -131,8 +117,3 @@ def _map_of(estimator: DepthEstimator, image: Path) -> Float[np.ndarray, "h w"]:
         with atomic_path(file) as temporary:
             np.save(temporary, depth)
     return np.load(file).astype(np.float64)
-
-
-def _identity(name: Path, revision: str | None) -> str:
-    weights = sorted(name.glob("*.safetensors")) + sorted(name.glob("*.bin")) if name.is_dir() else []
-    return " ".join([str(name), str(revision), *map(file_sha256, weights)])

@@ -75,19 +75,18 @@ def _renderings(capture: Capture, ground: bool, renderer: Renderer) -> Generator
     """Every view, drawn by the builtin ray caster or by Blender; masks and depth maps are ray-cast with both."""
     camera, car = capture.camera, capture.car
     assert car is not None
-    pinhole = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     poses = capture.c2w.numpy()
     match renderer:
         case "builtin":
             assert not isinstance(car, MeshCar)
             for c2w in poses:
-                yield render_view(car, c2w, *pinhole, ground=ground)
+                yield render_view(car, c2w, camera, ground=ground)
         case "blender":
             with TemporaryDirectory(prefix="kronc-car-") as place:
                 mesh_car = car if isinstance(car, MeshCar) else write_mesh_car(car, Path(place) / "car.glb")
                 with closing(blender_views(mesh_car, capture.c2w, camera, ground)) as pictures:
                     for rgba, c2w in zip(pictures, poses, strict=True):
-                        yield Rendering(rgba, *trace_mask_and_depth(mesh_car.mesh, c2w, *pinhole, ground=ground))
+                        yield Rendering(rgba, *trace_mask_and_depth(mesh_car.mesh, c2w, camera, ground=ground))
         case _:
             assert_never(renderer)
 

@@ -12,6 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.synthetic.car import CarModel
 from kronc_ns.synthetic.car_paint import METRES_PER_TEXEL
 from kronc_ns.synthetic.surroundings import SUN, shade_surroundings, sky_colour, surroundings_distance
@@ -62,61 +63,50 @@ def _first_hit(mesh: trimesh.Trimesh, start: np.ndarray, direction: np.ndarray) 
 def render_view(
     car: CarModel,
     c2w: Float[np.ndarray, "3 4"],
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
+    camera: Camera,
     *,
     ground: bool,
     samples: int = 2,
 ) -> Rendering:
     """Renders the car from a pinhole camera with samples x samples rays a pixel; `ground` adds the car park."""
-    fine = (cx * samples, cy * samples, fx * samples, fy * samples)
+    width, height = camera.width, camera.height
+    fine = camera.scaled(float(samples))
     colour = np.empty((height, width, 4), np.float32)
     band = max(1, RAYS_PER_CHUNK // (width * samples**2))
     for top in range(0, height, band):
         rows = np.arange(top * samples, min(top + band, height) * samples)
-        ray, footprint = _camera_rays(c2w, fine, rows, width * samples)
+        ray, footprint = _camera_rays(c2w, fine, rows)
         rgba = _shade_rays(car, c2w[:, 3], ray, footprint, ground)
         colour[top : top + band] = rgba.reshape(-1, samples, width, samples, 4).mean((1, 3))
     colour[..., :3] /= np.maximum(colour[..., 3:], 1e-6)
     rgba = np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)
-    return Rendering(rgba, *trace_mask_and_depth(car.mesh, c2w, fx, fy, cx, cy, width, height, ground=ground))
+    return Rendering(rgba, *trace_mask_and_depth(car.mesh, c2w, camera, ground=ground))
 
 
 def trace_mask_and_depth(
     mesh: trimesh.Trimesh,
     c2w: Float[np.ndarray, "3 4"],
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
+    camera: Camera,
     *,
     ground: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mask and depth as in `Rendering`, by one ray through each pixel's centre."""
-    ray, _ = _camera_rays(c2w, (cx, cy, fx, fy), np.arange(height), width)
+    ray, _ = _camera_rays(c2w, camera, np.arange(camera.height))
     start = np.broadcast_to(c2w[:, 3], ray.shape)
     distance, face = _first_hit(mesh, start, ray)
     if ground:
         distance = np.minimum(distance, surroundings_distance(start, ray))
     z = np.where(np.isfinite(distance), distance * (ray @ c2w[:, 2]), 0)
     mask = np.where(face >= 0, 255, 0).astype(np.uint8)
-    return mask.reshape(height, width), z.astype(np.float32).reshape(height, width)
+    shape = camera.height, camera.width
+    return mask.reshape(shape), z.astype(np.float32).reshape(shape)
 
 
-def _camera_rays(
-    c2w: np.ndarray, intrinsics: tuple[float, ...], rows: np.ndarray, width: int
-) -> tuple[np.ndarray, float]:
+def _camera_rays(c2w: np.ndarray, camera: Camera, rows: np.ndarray) -> tuple[np.ndarray, float]:
     """Unit rays [rows * width, 3] in the world through pixel centres, and the angle of a pixel in radians."""
-    cx, cy, fx, fy = intrinsics
-    u, v = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy)
+    u, v = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy)
     ray = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ c2w[:, :3].T
-    return ray / np.linalg.norm(ray, axis=1, keepdims=True), 1 / min(fx, fy)
+    return ray / np.linalg.norm(ray, axis=1, keepdims=True), 1 / min(camera.fx, camera.fy)
 
 
 def _shade_rays(car: CarModel, eye: np.ndarray, ray: np.ndarray, footprint: float, ground: bool) -> np.ndarray:

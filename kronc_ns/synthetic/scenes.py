@@ -158,6 +158,4 @@ def make_capture(
             c2w = walk_poses(views, rng)
         case _:
             assert_never(preset)
-    return observe(
-        car or build_car(CarShape()), c2w, camera or default_camera(preset), rng, noise_px, missing, outliers
-    )
+    return observe(car or build_car(CarShape()), c2w, camera, rng, noise_px, missing, outliers)

@@ -16,7 +16,7 @@ from nerfstudio.data.scene_box import SceneBox  # noqa: E402
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes  # noqa: E402
 from nerfstudio.engine.optimizers import Optimizers  # noqa: E402
 
-from kronc_ns.benchmark.training import evaluate, run, train, write_variant  # noqa: E402
+from kronc_ns.benchmark.training import train, write_variant  # noqa: E402
 from kronc_ns.pipeline import KroncConfig  # noqa: E402
 from kronc_ns.plugin.compatibility import UnavailableLpips  # noqa: E402
 from kronc_ns.plugin.dvgo import equations  # noqa: E402
@@ -34,6 +34,7 @@ from kronc_ns.plugin.dvgo.sampling import ray_box, sample_rays  # noqa: E402
 from kronc_ns.plugin.methods import kronc_dvgo_cpu  # noqa: E402
 from kronc_ns.synthetic.folder import write_capture  # noqa: E402
 from kronc_ns.synthetic.scenes import default_camera, make_capture  # noqa: E402
+from tests.plugin.commands import evaluate, run  # noqa: E402
 
 BOX = torch.tensor([[-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]])
 RADIUS = 0.4

@@ -10,7 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models import splatfacto
 
-from kronc_ns.benchmark.training import add_half_size, evaluate, run, train, write_variant
+from kronc_ns.benchmark.training import train, write_variant
 from kronc_ns.config import load_config
 from kronc_ns.plugin.compatibility import allow_numpy_in_checkpoints, train_without_lpips_weights
 from kronc_ns.plugin.splat_cpu import kernels
@@ -21,6 +21,7 @@ from kronc_ns.plugin.splat_cpu.rendering import rasterization
 from kronc_ns.plugin.splat_cpu.tiles import tile_lists
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
+from tests.plugin.commands import add_half_size, evaluate, run
 
 from . import splat_reference
 

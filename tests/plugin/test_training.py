@@ -4,12 +4,15 @@ import json
 import math
 
 import pytest
-import torch
 
-from kronc_ns.benchmark.training import add_half_size, evaluate, run, train, write_variant
+from kronc_ns.benchmark.training import train, write_poses, write_variant
 from kronc_ns.config import load_config
+from kronc_ns.geometry.alignment import umeyama
+from kronc_ns.init import circular_poses
+from kronc_ns.scene import load_scene
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
+from tests.plugin.commands import add_half_size, evaluate, run
 
 pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 ITERATIONS = ["--max-num-iterations", "500"]
@@ -23,10 +26,14 @@ def runs(tmp_path_factory):
     capture = make_capture("walk", views=32, seed=3, noise_px=0.67, camera=default_camera("walk", 320))
     write_capture(root / "capture", capture, render=True)
     add_half_size(root / "capture")
-    points = torch.from_numpy(capture.car.keypoints)
+    config = load_config("phone_walk")
+    for which in ("exact", "solved"):
+        write_variant(root / which, root / "capture", which, config, capture.points)
+    circle = circular_poses(len(capture.c2w), config.radius_m, config.direction, config.laps)
+    nearest = umeyama(circle[..., 3], capture.c2w[..., 3]).apply_to_poses(circle)
+    write_poses(root / "circle", root / "capture", load_scene(root / "capture"), nearest, capture.points)
     configs = {}
     for which in ("exact", "solved", "circle"):
-        write_variant(root / which, root / "capture", which, load_config("phone_walk"), points)
         configs[which] = train(root / which, "kronc-tensorf-cpu", root / "runs", ITERATIONS, HALF)
     return configs
 

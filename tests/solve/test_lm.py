@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from kronc_ns.benchmark.likelihood import maximum_likelihood
 from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import KeypointSchema
@@ -15,6 +14,7 @@ from kronc_ns.scene import Scene
 from kronc_ns.solve.bundle import residuals
 from kronc_ns.solve.lm import LmConfig, LmResult, adjust
 from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State, focal_of
+from tests.likelihood import maximum_likelihood
 from tests.solve.problems import FOCAL, SIMILARITY, moved, randn, scene, started
 
 

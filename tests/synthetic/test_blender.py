@@ -57,7 +57,7 @@ def test_silhouettes_are_those_of_our_rays(car):
     """Also with oblong pixels and the principal point aside."""
     c2w = poses((4, 3, 2), (-5, 2, 1), (1, -5, 3))
     for rgba, pose in zip(blender_views(car, c2w, CAMERA, ground=False), c2w.numpy(), strict=True):
-        mask, _ = trace_mask_and_depth(car.mesh, pose, 150.0, 120.0, 70.0, 40.0, 128, 96, ground=False)
+        mask, _ = trace_mask_and_depth(car.mesh, pose, CAMERA, ground=False)
         inside, covered = mask > 0, rgba[..., 3] > 127
         assert 0.05 < inside.mean() < 0.7
         assert (inside & covered).sum() / (inside | covered).sum() > 0.98

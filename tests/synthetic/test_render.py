@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.synthetic.car import CarModel, build_car
 from kronc_ns.synthetic.car_parts import CarShape
 from kronc_ns.synthetic.render import Rendering, keypoint_visibility, render_view
@@ -28,7 +29,7 @@ def ring_pose(azimuth_deg: float, radius_m: float = 4.5, height_m: float = 1.5) 
 
 
 def view(car: CarModel, c2w: np.ndarray, *, ground: bool, samples: int = 2) -> Rendering:
-    return render_view(car, c2w, FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE, ground=ground, samples=samples)
+    return render_view(car, c2w, Camera(FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE), ground=ground, samples=samples)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ def test_visibility_of_a_hundred_views_takes_less_than_a_second(car: CarModel) -
 def test_depth_is_z_of_the_visible_keypoints(car: CarModel, azimuth_deg: float) -> None:
     c2w = ring_pose(azimuth_deg)
     focal, size = 500.0, 600
-    rendering = render_view(car, c2w, focal, focal, size / 2, size / 2, size, size, ground=False, samples=1)
+    rendering = render_view(car, c2w, Camera(focal, focal, size / 2, size / 2, size, size), ground=False, samples=1)
     visible = keypoint_visibility(car.mesh, car.keypoints, c2w[None, :, 3])[0]
     local = (car.keypoints[visible] - c2w[:, 3]) @ c2w[:, :3]
     column, row = np.floor(local[:, :2] / local[:, 2:] * focal + size / 2).astype(int).T
@@ -154,5 +155,5 @@ def test_supersampling_converges(car: CarModel) -> None:
 def test_principal_point_shifts_the_image(car: CarModel) -> None:
     c2w = ring_pose(50)
     centred = view(car, c2w, ground=True)
-    moved = render_view(car, c2w, FOCAL, FOCAL, SIZE / 2 - 10, SIZE / 2 + 4, SIZE, SIZE, ground=True)
+    moved = render_view(car, c2w, Camera(FOCAL, FOCAL, SIZE / 2 - 10, SIZE / 2 + 4, SIZE, SIZE), ground=True)
     np.testing.assert_array_equal(moved.rgba[4:, :-10], centred.rgba[:-4, 10:])

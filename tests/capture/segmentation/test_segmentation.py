@@ -221,12 +221,15 @@ def test_the_real_mask2former_with_few_untrained_weights(tmp_path: Path):
     model.save_pretrained(tmp_path / "model")
     Mask2FormerImageProcessor(size={"height": 64, "width": 64}).save_pretrained(tmp_path / "model")
     rgb = np.random.default_rng(0).integers(0, 255, (90, 120, 3), dtype=np.uint8)
-    labels = Mask2FormerSegmenter(tmp_path / "model").segment(rgb)
+    segmenter = Mask2FormerSegmenter(tmp_path / "model")
+    labels = segmenter.segment(rgb)
     assert labels.shape == (90, 120)
     assert 1 <= labels.max() <= 4
     model.class_predictor.bias.data = torch.tensor([9.0, -9.0, -9.0])
     model.save_pretrained(tmp_path / "model")
-    assert Mask2FormerSegmenter(tmp_path / "model").segment(rgb).max() == 0
+    other = Mask2FormerSegmenter(tmp_path / "model")
+    assert other.segment(rgb).max() == 0
+    assert other.identity != segmenter.identity  # or masks of the first would be taken for the second's
     with pytest.raises(KroncError, match=r"nowhere cannot be loaded .*--segmenter-weights a folder"):
         Mask2FormerSegmenter(tmp_path / "nowhere")
 
