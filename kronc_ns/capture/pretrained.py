@@ -9,6 +9,9 @@ import torch
 from kronc_ns.capture.detection.model import file_sha256
 from kronc_ns.errors import KroncError
 
+_WEIGHTS = (".safetensors", ".bin")
+"""Files of weights, the preferred first."""
+
 
 @dataclass(frozen=True)
 class Pretrained:
@@ -19,7 +22,7 @@ class Pretrained:
     model: Any
     device: torch.device
     name: str
-    """Changes with the weights: name and revision on the hub, or the content of the folder."""
+    """Changes with the weights: it holds a digest of their files."""
 
 
 def transformers_for(option: str, extra: str) -> Any:
@@ -38,19 +41,32 @@ def load_pretrained(model_class: Any, weights: Path | None, default: str, option
 
     Raises `KroncError` that says what to give as ``option`` where they cannot be loaded.
     """
+    from huggingface_hub.errors import HfHubHTTPError
     from transformers import AutoImageProcessor
 
-    name = str(weights or default)
     try:
-        processor = AutoImageProcessor.from_pretrained(name)
-        model = model_class.from_pretrained(name)
-    except (OSError, ValueError) as error:
+        if weights and not weights.is_dir():
+            raise FileNotFoundError("it is no folder")
+        folder = weights or _downloaded(default)
+        processor = AutoImageProcessor.from_pretrained(folder)
+        model = model_class.from_pretrained(folder)
+    except (OSError, ValueError, HfHubHTTPError) as error:
         raise KroncError(
-            f"{name} cannot be loaded ({str(error).strip().splitlines()[0]}): give as {option} a folder "
+            f"{weights or default} cannot be loaded ({str(error).strip().splitlines()[0]}): give as {option} a folder "
             f"with what `hf download {default} --local-dir FOLDER` fetches"
         ) from None
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    folder, revision = Path(name), getattr(model.config, "_commit_hash", None)
-    files = sorted(folder.glob("*.safetensors")) + sorted(folder.glob("*.bin")) if folder.is_dir() else []
-    told_apart = " ".join([name, str(revision), *map(file_sha256, files)])
-    return Pretrained(processor, model.eval().to(device), device, told_apart)
+    files = sorted(path for path in folder.iterdir() if path.suffix in _WEIGHTS)
+    name = " ".join([str(weights or default), *map(file_sha256, files)])
+    return Pretrained(processor, model.eval().to(device), device, name)
+
+
+def _downloaded(name: str) -> Path:
+    """The hub's files of a network; what an earlier run fetched where there is no internet."""
+    from huggingface_hub import snapshot_download
+
+    for weights in _WEIGHTS:
+        folder = Path(snapshot_download(name, allow_patterns=["*.json", f"*{weights}"]))
+        if any(folder.glob(f"*{weights}")):
+            return folder
+    raise FileNotFoundError(f"the hub has no {' or '.join(_WEIGHTS)} file of it")
