@@ -14,7 +14,14 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
-from kronc_ns.capture.images import copy_upright, downscale_factors, level_path, upright_size, write_downscales
+from kronc_ns.capture.images import (
+    HEIF_SUFFIXES,
+    copy_upright,
+    downscale_factors,
+    level_path,
+    upright_size,
+    write_downscales,
+)
 from kronc_ns.capture.selection import Sampling
 from kronc_ns.capture.source import IMAGE_SUFFIXES, MIN_FRAMES, Count, Source
 from kronc_ns.capture.video import VideoFrames, probe_video
@@ -130,10 +137,14 @@ def prepare_frames(
 
 
 def frame_names(images: Sequence[Path]) -> tuple[str, ...]:
-    """New paths: files that are all called frame_NNNNN keep their names, others are counted from 1."""
+    """New paths: files that are all called frame_NNNNN keep their names, others are counted from 1.
+
+    HEIF becomes JPEG, which trainers read.
+    """
     if all(_OURS.fullmatch(image.name) for image in images) and len({image.name for image in images}) == len(images):
         return tuple(f"images/{image.name}" for image in images)
-    return tuple(f"images/frame_{number:05d}{image.suffix.lower()}" for number, image in enumerate(images, start=1))
+    suffixes = (".jpg" if image.suffix.lower() in HEIF_SUFFIXES else image.suffix.lower() for image in images)
+    return tuple(f"images/frame_{number:05d}{suffix}" for number, suffix in enumerate(suffixes, start=1))
 
 
 def copy_depths(source: Source, frames: Frames, out: Path) -> tuple[str, ...] | None:

@@ -11,7 +11,18 @@ from PIL import ExifTags, Image, ImageOps
 from kronc_ns.errors import KroncError
 
 _READ_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+HEIF_SUFFIXES = (".heic", ".heif")
+"""Photos that `read_heif` lets be read, in lower case."""
 _SMALLEST_SIDE = 100  # px; below, a downscaled copy shows nothing to train on
+
+
+def read_heif(path: Path) -> None:
+    """Let Pillow read HEIF, upright, in this process; ``path`` is the photo that asks for it."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        raise KroncError(f"{path} needs pillow-heif, which is not installed: pip install 'kronc-ns[heic]'") from None
+    register_heif_opener(thumbnails=False)
 
 
 def load_image(path: Path) -> Image.Image:
@@ -47,10 +58,13 @@ def upright_size(path: Path, orient: bool = True) -> tuple[int, int]:
 
 
 def copy_upright(source: Path, target: Path, orient: bool = True) -> Image.Image:
-    """Copy a photo with its EXIF orientation applied; byte for byte where there is none. Returns the image."""
+    """Copy a photo with its EXIF orientation applied; byte for byte where there is none. Returns the image.
+
+    A photo of another format than ``target`` (HEIF, which few programs read) is coded anew.
+    """
     image = load_image(source)
-    if orient and is_turned(image):
-        upright = ImageOps.exif_transpose(image)
+    if (orient and is_turned(image)) or source.suffix.lower() != target.suffix.lower():
+        upright = ImageOps.exif_transpose(image) if orient else image
         options: dict[str, Any] = (
             {"quality": 95, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
         )

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from kronc_ns.capture.images import HEIF_SUFFIXES, read_heif
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.io import read_json
@@ -18,6 +19,8 @@ from kronc_ns.scene import camera_and_frames, read_poses
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 """Image files that are taken, in lower case."""
+PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+"""What is taken of a folder of photos."""
 MIN_FRAMES = 3
 """Fewer views cannot be solved."""
 Count = Callable[[int, int, None], None]
@@ -54,7 +57,7 @@ def find_source(data: Path) -> Source:
         raise KroncError(f"{data} does not exist: expected a scene folder, a folder of photos or a video")
     if data.is_dir():
         return _scene(data) if (data / "transforms.json").exists() else _photos(data)
-    if data.suffix.lower() in IMAGE_SUFFIXES:
+    if data.suffix.lower() in PHOTO_SUFFIXES:
         raise KroncError(f"{data} is a single image: give the folder of at least {MIN_FRAMES} photos, or a video")
     if data.suffix.lower() == ".json":
         raise KroncError(f"{data} is a JSON file: give the folder that holds it")
@@ -68,27 +71,27 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     ]
 
 
-def list_images(folder: Path) -> tuple[Path, ...]:
+def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> tuple[Path, ...]:
     """Image files of a folder (no subfolders, no hidden files), naturally sorted."""
-    files = [
-        f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".") and f.is_file()
-    ]
+    files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and not f.name.startswith(".") and f.is_file()]
     return tuple(sorted(files, key=lambda file: natural_key(file.name)))
 
 
 def _photos(data: Path) -> Source:
     folder = data
-    images = list_images(data)
+    images = list_images(data, PHOTO_SUFFIXES)
     if not images and (data / "images").is_dir():
         folder = data / "images"
-        images = list_images(folder)
+        images = list_images(folder, PHOTO_SUFFIXES)
     if not images:
         others = Counter(f.suffix.lower() for f in folder.iterdir() if f.is_file() and f.suffix)
         found = ", ".join(f"{count} {suffix}" for suffix, count in others.most_common(3)) or "no files"
         raise KroncError(
-            f"{folder} holds no images that can be read ({found}): expected {', '.join(IMAGE_SUFFIXES)}, "
+            f"{folder} holds no images that can be read ({found}): expected {', '.join(PHOTO_SUFFIXES)}, "
             "a transforms.json, or as --data a video file itself"
         )
+    if heif := next((image for image in images if image.suffix.lower() in HEIF_SUFFIXES), None):
+        read_heif(heif)
     names = tuple(image.name for image in images)
     masks = data / "masks"
     return Source(

@@ -1,6 +1,7 @@
 """Photos and videos become upright frames of one size, and what cannot is named."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from PIL import ExifTags, Image
 
 from kronc_ns.capture.frames import Frames, check_source, copy_reference, find_frames, frame_names, prepare_frames
 from kronc_ns.capture.images import downscale, downscale_factors
+from kronc_ns.capture.intrinsics import read_exif_focal
 from kronc_ns.capture.masks import downscale_mask, find_masks, read_mask, write_masks
 from kronc_ns.capture.source import find_source, natural_key
 from kronc_ns.errors import KroncError
@@ -82,6 +84,39 @@ def test_exif_orientation_is_applied_once(tmp_path: Path, orientation: int, size
             assert not _is_red(image, (1 - red[0], 1 - red[1]))
 
 
+def test_heif_photos_become_jpeg_with_their_exif(tmp_path: Path):
+    heif = pytest.importorskip("pillow_heif")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 26
+    for i, name in enumerate(("IMG_9.HEIC", "IMG_10.HEIC", "Küche 3.heic")):
+        heif.from_pillow(_picture(640, 480, seed=i)).save(photos / name, quality=95, exif=exif)
+    source = find_source(photos)
+    assert check_source(source) == (640, 480)
+    assert source.names == ("IMG_9.HEIC", "IMG_10.HEIC", "Küche 3.heic")
+    focal, _ = read_exif_focal(source.images[0])
+    assert focal is not None
+    assert focal.px == pytest.approx(26 / 43.27 * 800)
+    frames = _prepare(photos, tmp_path / "out")
+    assert frames.names == ("images/frame_00001.jpg", "images/frame_00002.jpg", "images/frame_00003.jpg")
+    for i, name in enumerate(frames.names):
+        with Image.open(tmp_path / "out" / name) as copy:
+            assert copy.format == "JPEG"
+            assert copy.getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] == 26
+            difference = np.asarray(copy, float) - np.asarray(_picture(640, 480, seed=i), float)
+        assert abs(difference.mean()) < 2
+        assert np.abs(difference).mean() < 16  # the picture is noise, which codes poorly
+    assert (tmp_path / "out/images_2/frame_00001.jpg").is_file()
+
+
+def test_without_its_reader_heif_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    (tmp_path / "a.HEIC").touch()
+    with pytest.raises(KroncError, match=r"a\.HEIC needs pillow-heif.*pip install 'kronc-ns\[heic\]'"):
+        find_source(tmp_path)
+
+
 def test_a_scene_folder_keeps_stored_pixels(tmp_path: Path):
     names = [f"images/frame_{i:05d}.jpg" for i in (1, 2, 3)]
     for name in names:
@@ -119,8 +154,8 @@ def test_unreadable_images_are_named(tmp_path: Path):
 def test_what_is_no_capture_is_named(tmp_path: Path):
     with pytest.raises(KroncError, match="does not exist"):
         find_source(tmp_path / "nothing")
-    (tmp_path / "a.heic").touch()
-    with pytest.raises(KroncError, match=r"1 \.heic.*expected \.png"):
+    (tmp_path / "a.raw").touch()
+    with pytest.raises(KroncError, match=r"1 \.raw.*expected \.png"):
         find_source(tmp_path)
     _photo(tmp_path / "a.png")
     with pytest.raises(KroncError, match="holds 1 images: expected at least 3"):
