@@ -66,11 +66,11 @@ def with_noise(subject: Subject, noise_px: float, seed: int) -> Subject:
 
 
 def thinned(subject: Subject, views: int) -> Subject:
-    """So many of the views, evenly spread over the capture."""
+    """So many of the views, evenly spread over a capture in which the first follows the last, as on a lap."""
     if not 3 <= views <= len(subject.truth):
         raise KroncError(f"{views} views of {subject.name}: expected 3 to {len(subject.truth)}")
     keep = torch.zeros(len(subject.truth), dtype=torch.bool)
-    keep[torch.linspace(0, len(keep) - 1, views).round().long()] = True
+    keep[torch.arange(views) * len(keep) // views] = True
     return replace(subject, scene=chosen_views(subject.scene, keep), truth=subject.truth[keep])
 
 
