@@ -84,22 +84,26 @@ def _installer(tool: str, python: Path) -> tuple[list[str | Path], list[str | Pa
 
 @pytest.mark.parametrize("editable", [False, True], ids=["plain", "editable"])
 @pytest.mark.parametrize("tool", ["pip", "uv"])
-def test_kronc_comes_and_goes_with_the_package(tool: str, editable: bool, python: Path, project: Path):
+def test_the_hook_comes_and_goes_with_the_package(tool: str, editable: bool, python: Path, project: Path):
     install, uninstall = _installer(tool, python)
-    assert "kronc" not in _help(python)
-
     _run(*install, *(["-e"] if editable else []), project)
     assert _hook_files(python) == ["kronc_ns_hook.pth", "kronc_ns_hook.py"]
     package = _run(python, "-c", "import kronc_ns; print(kronc_ns.__file__)").strip()
     assert Path(package).is_relative_to(project if editable else python.parents[1])
     assert "kronc" in _help(python)
-    assert "kronc" not in _help(python, KRONC_NS_NO_HOOK="1")
-    assert "--keypoints" in _run(python.with_name("kronc-process-data"), "--help")
 
     _run(*uninstall, "kronc-ns")
     assert _hook_files(python) == []
     assert not python.with_name("kronc-process-data").exists()
-    assert "kronc" not in _help(python)
+
+
+def test_nerfstudio_is_as_before_without_the_hook(python: Path, project: Path):
+    install, _ = _installer("pip", python)
+    before = _help(python)
+    assert "kronc" not in before
+    _run(*install, project)
+    assert _help(python, KRONC_NS_NO_HOOK="1") == before
+    assert "--keypoints" in _run(python.with_name("kronc-process-data"), "--help")
 
 
 def test_the_wheel_holds_the_presets_and_one_copy_of_the_hook(project: Path, tmp_path: Path):
