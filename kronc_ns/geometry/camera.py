@@ -56,8 +56,19 @@ class Camera:
         if not any(self.distortion):
             return uv
         flat = uv.reshape(-1, 1, 2).double().cpu().numpy()
-        ideal = cv2.undistortPoints(flat, self.matrix, np.array(self.distortion), P=self.matrix)
+        # OpenCV's default of five iterations leaves up to a pixel in the corners of wide lenses
+        exactly = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+        ideal = cv2.undistortPointsIter(flat, self.matrix, np.array(self.distortion), np.eye(3), self.matrix, exactly)
         return torch.from_numpy(ideal.reshape(uv.shape)).to(uv)
+
+    def distort(self, uv: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Pixels of the ideal pinhole camera as this one sees them: the inverse of `undistort`."""
+        if not any(self.distortion):
+            return uv
+        flat = uv.reshape(-1, 2).double().cpu().numpy()
+        at_depth_1 = np.column_stack([(flat - (self.cx, self.cy)) / (self.fx, self.fy), np.ones(len(flat))])
+        seen, _ = cv2.projectPoints(at_depth_1, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
+        return torch.from_numpy(seen.reshape(uv.shape)).to(uv)
 
     def scaled(self, factor: float) -> "Camera":
         """The camera of the same image resized by ``factor``."""

@@ -134,7 +134,8 @@ def observe(
         visible = torch.from_numpy(hull_visibility(points.numpy(), centres.numpy()))
     in_camera = transform(invert(c2w), points.expand(len(c2w), -1, -1))
     visible &= in_camera[..., 2] > 0.1
-    keypoints, wild = detect(project(in_camera, camera), visible, camera, rng, noise_px, missing, outliers)
+    uv = camera.distort(project(in_camera, camera))
+    keypoints, wild = detect(uv, visible, camera, rng, noise_px, missing, outliers)
     return Capture(car, points, camera, c2w, keypoints, wild)
 
 

@@ -40,13 +40,14 @@ def test_project_jacobian_against_finite_differences():
     assert torch.autograd.gradcheck(lambda p: project(p, CAMERA), points)
 
 
-def test_undistort_inverts_opencvs_distortion():
-    camera = Camera(500.0, 500.0, 320.0, 240.0, 640, 480, k1=-0.12, k2=0.03, p1=0.001, p2=-0.002)
+@pytest.mark.parametrize("lens", [(-0.12, 0.03, 0.001, -0.002), (-0.35, 0.12, 0.0, 0.0), (0.6, 0.3, 0.0, 0.0)])
+def test_undistort_inverts_opencvs_distortion(lens: tuple[float, ...]):
+    camera = Camera(500.0, 500.0, 320.0, 240.0, 640, 480, *lens)
     ideal = torch.rand(20, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 300 + 100
     directions = rays(ideal, camera).numpy()
     distorted, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))
-    back = camera.undistort(torch.from_numpy(distorted[:, 0]))
-    np.testing.assert_allclose(back.numpy(), ideal.numpy(), atol=0.02)
+    np.testing.assert_allclose(camera.distort(ideal), distorted[:, 0], atol=1e-9)
+    np.testing.assert_allclose(camera.undistort(torch.from_numpy(distorted[:, 0])), ideal, atol=1e-6)
 
 
 def test_scaling_the_image_scales_the_pixels():

@@ -25,7 +25,7 @@ from kronc_ns.plugin import process_data
 from kronc_ns.plugin.process_data import KroncToNerfstudio
 from kronc_ns.scene import load_scene, read_poses
 from kronc_ns.synthetic.folder import write_capture
-from kronc_ns.synthetic.scenes import Capture, make_capture
+from kronc_ns.synthetic.scenes import Capture, default_camera, make_capture
 from tests.capture.detection.dots import Net
 
 VIEWS = 12
@@ -220,6 +220,27 @@ def test_keypoints_may_use_the_names_of_the_photos(
     assert _status(command) == 0
     assert (load_scene(out).keypoints - capture.keypoints).abs().max() < 2e-3
     assert load_scene(out).masks is not None
+
+
+def test_a_calibration_goes_through_to_the_dataset(scene: Path, tmp_path: Path, config: SolverOptions):
+    lens = dataclasses.replace(default_camera("walk"), k1=-0.12, k2=0.03, cx=236.0)
+    capture = make_capture("walk", views=VIEWS, seed=3, camera=lens)
+    _write_openpifpaf(tmp_path / "pifpaf", capture, [f"IMG_{i}.jpg" for i in range(1, VIEWS + 1)])
+    double = lens.scaled(2.0)  # as a photo of the target would give it
+    calibration = {"fl_x": double.fx, "fl_y": double.fy, "cx": double.cx, "cy": double.cy, "w": 960, "h": 540}
+    (tmp_path / "lens.json").write_text(json.dumps({**calibration, "k1": double.k1, "k2": double.k2}))
+    out = tmp_path / "out"
+    command = KroncToNerfstudio(
+        data=scene / "images",
+        output_dir=out,
+        keypoints=tmp_path / "pifpaf",
+        camera=tmp_path / "lens.json",
+        solve=config,
+    )
+    assert _status(command) == 0
+    assert load_scene(out).camera == lens
+    truth = dict(zip([f"images/frame_{i:05d}.jpg" for i in range(1, VIEWS + 1)], capture.c2w, strict=True))
+    assert evaluate_poses(read_poses(out / "transforms.json"), truth).as_dict()["rotation_deg"]["max"] < 0.01
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
