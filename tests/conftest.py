@@ -136,7 +136,7 @@ BROWSER_PATIENCE_MS = 180_000
 _CHROMIUM_FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # it draws the viewer as long as it lives
 def browser():
     """Debian's chromium, driven by Playwright."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
