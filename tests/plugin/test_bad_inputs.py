@@ -72,10 +72,10 @@ def painted(rendered, tmp_path) -> Callable[[str, int], Path]:
 
     def paint(kind: str, value: int) -> Path:
         source = rendered()
-        capture = next(source.parent.glob("capture_0"))
-        shutil.copytree(capture, tmp_path / "capture_0")
-        shutil.copytree(source, tmp_path / source.name)
-        for path in (tmp_path / "capture_0" / kind).iterdir():
+        capture = source.with_name(source.name.replace("exact", "capture"))
+        for folder in (capture, source):
+            shutil.copytree(folder, tmp_path / folder.name)
+        for path in (tmp_path / capture.name / kind).iterdir():
             Image.fromarray(np.full_like(np.asarray(Image.open(path)), value)).save(path)
         return tmp_path / source.name
 
