@@ -25,6 +25,7 @@ from kronc_ns.starts import MIN_POINTS, Start, far_side, in_front, usable_views
 _NO_CHANCE = 8  # a pose can be bent to meet three detections; eight do not agree by accident
 _PADDING = 8  # views are padded to a multiple, so that scenes of similar size share a batch
 _BATCH_VIEWS = 400  # views in a batch: what stays in the processor's cache
+_STEPS_KEPT = 20  # of the poses on the way: enough to watch them move
 _REFINEMENTS = 3  # more rounds of undistortion with the k1 found
 
 
@@ -44,6 +45,8 @@ class Attempt:
     iterations: int
     converged: bool
     history: dict[str, list[float]]
+    path: Float[Tensor, "s n 3 4"]
+    """Poses at steps on the way, in the gauge of the solver."""
     choice: str = ""
     """Why this start was preferred to others."""
 
@@ -115,10 +118,17 @@ def _run(
             covariance[i, : len(start.scene)],
             iterations[i],
             converged[i],
-            result.history if i == 0 else {},
+            result.history(i),
+            on_the_way(result.path(i)[:, : len(start.scene)], start.used),
         )
         for i, (start, first) in enumerate(zip(starts, began, strict=True))
     ]
+
+
+def on_the_way(path: Float[Tensor, "s n 3 4"], used: Bool[Tensor, "n"]) -> Float[Tensor, "k n 3 4"]:
+    """A few of the steps, evenly spread; NaN for views that take no part."""
+    chosen = torch.linspace(0, len(path) - 1, min(len(path), _STEPS_KEPT)).round().long()
+    return torch.where(used[:, None, None], path[chosen].double().cpu(), math.nan)
 
 
 def _problem(starts: list[Start], views: int, refine: tuple, prior: ShapePrior | None) -> tuple[Problem, State]:
@@ -161,6 +171,7 @@ def measured(
     initial_c2w: Float[Tensor, "n 3 4"],
     iterations: int,
     history: dict[str, list[float]],
+    path: Float[Tensor, "s n 3 4"],
 ) -> Attempt:
     """An attempt of another solver, with inliers and covariance as this one's have them."""
     scene = start.scene
@@ -176,7 +187,7 @@ def measured(
         problem, state = _problem([known], len(scene), (), None)
         one = torch.ones(1, dtype=torch.float64)
         covariance = camera_covariance(problem, state, inlier[None], one * sigma_px, one)[0]
-    return Attempt(start, initial_c2w, inlier, sigma_px, 1.0, covariance, iterations, True, history)
+    return Attempt(start, initial_c2w, inlier, sigma_px, 1.0, covariance, iterations, True, history, path)
 
 
 def misfit(attempt: Attempt) -> float:

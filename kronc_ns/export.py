@@ -159,7 +159,13 @@ def solution_dict(solution: Solution) -> dict[str, Any]:
         "points": [[_number(x) for x in point] for point in solution.points.tolist()],
         "history": {key: [_number(x) for x in values] for key, values in solution.history.items()},
         "initial_c2w": [_rounded(pose) for pose in solution.initial_c2w.flatten(1).tolist()],
+        "path_c2w": [[_rounded(pose) for pose in step] for step in _steps(solution).flatten(2).tolist()],
     }
+
+
+def _steps(solution: Solution) -> Float[Tensor, "s n 3 4"]:
+    initial = solution.initial_c2w
+    return initial.new_empty(0, *initial.shape) if solution.path is None else solution.path
 
 
 def _number(value: float) -> float | None:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import assert_never
 
-from kronc_ns.adjustment import Attempt, adjust_starts, measured, misfit
+from kronc_ns.adjustment import Attempt, adjust_starts, measured, misfit, on_the_way
 from kronc_ns.completion import complete
 from kronc_ns.errors import KroncError
 from kronc_ns.frame import standing, template_frame
@@ -227,7 +227,8 @@ def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attem
     c2w = torch.full_like(initial, math.nan)
     if not usable.any():
         points = torch.full((len(scene.schema), 3), math.nan, dtype=torch.float64)
-        return measured(Start(name, scene, c2w, points, usable, torch.zeros_like(usable)), initial, 0, {})
+        start = Start(name, scene, c2w, points, usable, torch.zeros_like(usable))
+        return measured(start, initial, 0, {}, c2w.new_empty(0, *c2w.shape))
     device = torch.device("cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu")
     result = _minimise(scene, config, initial, usable, device, progress)
     c2w[usable] = result.c2w.double().cpu()
@@ -238,7 +239,9 @@ def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attem
             "the optimisation diverged to values that are not finite: lower adam.learning_rate or mend the start"
         )
     start = Start(name, scene, c2w, points, usable, torch.zeros_like(usable))
-    return measured(start, initial, result.steps, result.history)
+    path = c2w.repeat(len(result.path), 1, 1, 1)
+    path[:, usable] = result.path.double().cpu()
+    return measured(start, initial, result.steps, result.history, on_the_way(path, usable))
 
 
 def _minimise(
@@ -290,6 +293,7 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig) -> Solution:
         rmse_px=math.nan,
         median_px=math.nan,
         history=attempt.history,
+        path=attempt.path,
     )
     variance = attempt.covariance.diagonal(dim1=-2, dim2=-1)
     evidence = Evidence(

@@ -42,6 +42,7 @@ def repair(attempts: Sequence[Attempt], config: KroncConfig) -> list[Attempt]:
                 initial_c2w=attempts[i].initial_c2w,
                 iterations=attempts[i].iterations + attempt.iterations,
                 history=attempts[i].history,
+                path=attempts[i].path,
             )
         active = changed
     return attempts

@@ -40,7 +40,8 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         names = tuple(relative_path(folder / record["data"], view["file_path"], folder) for view in record["views"])
         views = tuple(_view(view) for view in record["views"])
         points = _array(record["points"], (-1, 3))
-        initial = _array([pose or [None] * 12 for pose in record["initial_c2w"]], (len(views), 3, 4))
+        initial = _poses(record["initial_c2w"], len(views))
+        path = torch.stack([initial, *(_poses(step, len(views)) for step in record.get("path_c2w", []))])[1:]
         history = {key: [float(value) for value in values] for key, values in record["history"].items()}
         overall: dict[str, Any] = {key: record[key] for key in ("reason", "solver", "init", "iterations", "seconds")}
         for key in ("rmse_px", "median_px"):
@@ -73,6 +74,7 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         views=views,
         initial_c2w=initial,
         history=history,
+        path=path,
         **overall,
     )
     return Scene(names, camera, found.schema, keypoints), solution
@@ -81,6 +83,11 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
 def _view(view: dict[str, Any]) -> ViewReport:
     evidence = {key: value for key, value in view.items() if key != "file_path"}
     return ViewReport(**{**evidence, "name": view["file_path"], "status": ViewStatus(view["status"])})
+
+
+def _poses(poses: list[list[float] | None], count: int) -> Float[Tensor, "n 3 4"]:
+    """Rows of twelve numbers, null where there is no pose."""
+    return _array([pose or [None] * 12 for pose in poses], (count, 3, 4))
 
 
 def _array(values: Any, shape: tuple[int, ...]) -> Float[Tensor, "..."]:

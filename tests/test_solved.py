@@ -38,7 +38,7 @@ def swapped_lap(lap) -> tuple[Scene, Solution]:
 def test_what_is_read_is_what_was_solved(tmp_path, swapped_lap):
     scene, solution = swapped_lap
     again_scene, again = read_solution(written(tmp_path / "out", scene, solution))
-    for name in ("c2w", "points", "initial_c2w"):
+    for name in ("c2w", "points", "initial_c2w", "path"):
         torch.testing.assert_close(getattr(again, name), getattr(solution, name), atol=1e-5, rtol=0, equal_nan=True)
     straight = [i for i, view in enumerate(solution.views) if not view.swapped]
     torch.testing.assert_close(again.depths[straight], solution.depths[straight], atol=1e-9, rtol=0, equal_nan=True)

@@ -114,7 +114,7 @@ def convergence(solution: Solution) -> go.Figure | None:
     figure = go.Figure(go.Scatter(x=list(steps), y=list(loss), mode=mode, meta="solved", name="loss"))
     figure.update_layout(_layout(), showlegend=False)
     figure.update_xaxes(title="step")
-    figure.update_yaxes(title="loss", **_logarithmic(loss))
+    figure.update_yaxes(title="loss", **_axis(loss))
     return figure
 
 
@@ -143,7 +143,7 @@ def uncertainties(views: Sequence[ViewReport]) -> go.Figure | None:
             )
             figure.add_trace(trace, row=row, col=1)
     for row, title, values in rows:
-        figure.update_yaxes(title=title, **_logarithmic([value for value in values if value]), row=row, col=1)
+        figure.update_yaxes(title=title, **_axis([value for value in values if value]), row=row, col=1)
     figure.update_layout(_layout(height=420))
     figure.update_xaxes(title="view", row=2, col=1)
     return figure
@@ -168,9 +168,14 @@ def _layout(height: int = 360) -> dict:
     }
 
 
-def _logarithmic(values: Sequence[float]) -> dict:
-    """A logarithmic axis whose marks are whole numbers, for plotly writes a mere 2 for 0.2 and for 20."""
+def _axis(values: Sequence[float]) -> dict:
+    """A logarithmic axis, unless a factor of two spans all values.
+
+    Its marks are whole numbers, for plotly writes a mere 2 for 0.2 and for 20.
+    """
     low, high = math.log10(min(values)), math.log10(max(values))
+    if high - low < math.log10(2):
+        return {}
     digits = next((digits for decades, digits in _MARKS if high - low <= decades), (1.0,))
     exponents = range(math.floor(low), math.ceil(high) + 1)
     marks = [float(f"{digit}e{exponent}") for exponent in exponents for digit in digits]

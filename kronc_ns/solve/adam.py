@@ -7,7 +7,7 @@ preallocated buffers, without a graph: about three times the speed of autograd o
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -49,8 +49,10 @@ class AdamResult:
     """Centroids C^j; zero for keypoints that no view sees."""
     steps: int
     seconds: float
-    history: dict[str, list[float]] = field(default_factory=dict)
+    history: dict[str, list[float]]
     """"step" and "loss" at about a hundred steps."""
+    path: Float[Tensor, "s n 3 4"]
+    """Poses before each of them."""
 
 
 class LossGradient:
@@ -98,6 +100,10 @@ class LossGradient:
     def rotation(self) -> Float[Tensor, "n 3 3"]:
         """R_i of the current parameters."""
         return rotation_from_r6(self.r6)
+
+    def pose(self) -> Float[Tensor, "n 3 4"]:
+        """Camera poses (c2w) of the current parameters."""
+        return torch.cat([self.rotation(), self.t.unsqueeze(2)], dim=2)
 
     def centroids(self) -> Float[Tensor, "3 j"]:
         """C^j of the current parameters (eq. 2), refreshing the back-projections."""
@@ -196,6 +202,7 @@ def minimise(
     optimiser = torch.optim.Adam([gradient.parameters], lr=config.learning_rate, fused=True)
     report_every = max(1, config.steps // 100)
     history: dict[str, list[float]] = {"step": [], "loss": []}
+    path: list[Tensor] = []
     best, best_step, step = math.inf, 0, 0
     floor = config.learning_rate * config.decay
     with torch.no_grad(), one_thread():
@@ -209,6 +216,7 @@ def minimise(
                 value = gradient.value(norms)
                 history["step"].append(float(step))
                 history["loss"].append(value)
+                path.append(gradient.pose())
                 if progress is not None:
                     progress(step, value)
                 if value < best * 0.999:
@@ -217,5 +225,5 @@ def minimise(
                     break
             optimiser.step()
         points = gradient.centroids().T.contiguous()
-        pose = torch.cat([gradient.rotation(), gradient.t.unsqueeze(2)], dim=2)
-    return AdamResult(pose, gradient.z.clone(), points, step, time.perf_counter() - start, history)
+    seconds = time.perf_counter() - start
+    return AdamResult(gradient.pose(), gradient.z.clone(), points, step, seconds, history, torch.stack(path))

@@ -8,7 +8,7 @@ that without outliers the result is the maximum-likelihood one.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -32,10 +32,12 @@ from kronc_ns.solve.lm_cpu import (
     TRIM_SIGMAS,
     TRIMMED,
 )
-from kronc_ns.solve.problem import Batched, Problem, Residuals, ShapePrior, State, array
+from kronc_ns.solve.problem import Batched, Problem, Residuals, ShapePrior, State, array, poses_of
 from kronc_ns.solve.threads import aside
 
 _HUBER_SIGMAS = 2.0
+_RECORDED = 200
+"""Most steps of which the poses are kept."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,21 @@ class LmResult:
     """What the shape prior counted at last: 1 for a usual shape, less for an unusual one."""
     iterations: Int[Tensor, "b"]
     converged: Bool[Tensor, "b"]
-    history: dict[str, list[float]] = field(default_factory=dict)
-    """"step" and "loss" (root of the mean robust squared error, in pixels) of the first scene."""
+    loss: Float[Tensor, "b k"]
+    """Root of the mean robust squared error in pixels after each step, as far as there were `iterations`."""
+    rotations: Float[Tensor, "b s n 3 3"]
+    """World to camera after each of the first steps, as far as there were `iterations`."""
+    translations: Float[Tensor, "b s n 3"]
+
+    def history(self, scene: int = 0) -> dict[str, list[float]]:
+        """ "step" and "loss" of a scene."""
+        loss = self.loss[scene, : int(self.iterations[scene])].tolist()
+        return {"step": [float(step) for step in range(1, len(loss) + 1)], "loss": loss}
+
+    def path(self, scene: int) -> Float[Tensor, "s n 3 4"]:
+        """Poses (c2w) of a scene after each step, in the gauge of the solver."""
+        steps = int(self.iterations[scene])
+        return poses_of(self.rotations[scene, :steps], self.translations[scene, :steps])
 
 
 @dataclass(frozen=True)
@@ -110,7 +125,7 @@ def _adjust_compiled(
     scenes = len(problem.uv)
     state = start.each(lambda x: x.clone(memory_format=torch.contiguous_format))
     inlier = torch.zeros(problem.weight.shape, dtype=torch.bool)
-    losses = problem.uv.new_empty(config.iterations)
+    loss, rotations, translations = _record(problem, config)
     shape = problem.shape or ShapePrior.nothing(problem.uv)
     most = problem.uv.new_full((scenes,), math.inf) if most_sigma_px is None else most_sigma_px
     with aside():
@@ -119,18 +134,17 @@ def _adjust_compiled(
             *(array(problem.uv), array(problem.weight), array(problem.focal)),
             *(array(_redundancy(problem)), array(most), array(shape.mean), array(shape.precision), shape.freedom),
             *(problem.points_known, config.iterations, config.tolerance),
-            *(inlier.numpy(), losses.numpy()),
+            *(inlier.numpy(), loss.numpy(), rotations.numpy(), translations.numpy()),
         )
     found = torch.from_numpy(found)
     sigma, cost, shape_weight = found[:3]
     steps, converged = found[3].long(), found[4].bool()
-    detections = max(1, int((problem.weight[:1] > 0).sum()))
-    loss = (losses[: int(steps[0]) if scenes else 0] / detections).sqrt().tolist()
-    history = {"step": [float(step) for step in range(1, len(loss) + 1)], "loss": loss}
-    if progress is not None:
-        for step, value in enumerate(loss, start=1):
+    loss = (loss / _detections(problem)[:, None]).sqrt()
+    if progress is not None and scenes:
+        for step, value in enumerate(loss[0, : int(steps[0])].tolist(), start=1):
             progress(step, value)
-    return LmResult(state, cost / sigma.square(), sigma, inlier, shape_weight, steps, converged, history)
+    cost = cost / sigma.square()
+    return LmResult(state, cost, sigma, inlier, shape_weight, steps, converged, loss, rotations, translations)
 
 
 def _adjust(
@@ -160,17 +174,17 @@ def _adjust(
     finished = search
     steps = torch.zeros(scenes, dtype=torch.long, device=problem.uv.device)
     converged = torch.zeros(scenes, dtype=torch.bool, device=problem.uv.device)
-    history: dict[str, list[float]] = {"step": [], "loss": []}
-    detections = max(1, int((problem.weight[:1] > 0).sum()))
+    loss, rotations, translations = _record(problem, config)
+    detections = _detections(problem)
     for step in range(1, config.iterations + 1 if scenes else 1):
         search, done = _iterate(problem, search, counts, config)
         steps[search.scene] = step
-        if search.scene[0] == 0:
-            loss = math.sqrt(float(search.cost[0]) / detections)
-            history["step"].append(float(step))
-            history["loss"].append(loss)
-            if progress is not None:
-                progress(step, loss)
+        loss[search.scene, step - 1] = (search.cost / detections[search.scene]).sqrt()
+        if step <= _RECORDED:
+            rotations[search.scene, step - 1] = search.state.rotation
+            translations[search.scene, step - 1] = search.state.translation
+        if progress is not None and search.scene[0] == 0:
+            progress(step, float(loss[0, step - 1]))
         converged[search.scene[done]] = True
         leaving = done if step < config.iterations else torch.ones_like(done)
         if leaving.any():
@@ -188,8 +202,25 @@ def _adjust(
         shape_weight=_shape_weight(whole, finished.residual),
         iterations=steps,
         converged=converged,
-        history=history,
+        loss=loss,
+        rotations=rotations,
+        translations=translations,
     )
+
+
+def _record(
+    problem: Problem, config: LmConfig
+) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b s n 3 3"], Float[Tensor, "b s n 3"]]:
+    """Room for the loss of every step and the poses of the first (memory that is not written is never taken)."""
+    scenes, views = problem.uv.shape[:2]
+    steps = min(config.iterations, _RECORDED)
+    shapes = [(scenes, config.iterations), (scenes, steps, views, 3, 3), (scenes, steps, views, 3)]
+    loss, rotations, translations = (problem.uv.new_empty(shape) for shape in shapes)
+    return loss, rotations, translations
+
+
+def _detections(problem: Problem) -> Float[Tensor, "b"]:
+    return (problem.weight > 0).sum((1, 2)).clamp_min(1).to(problem.uv.dtype)
 
 
 def _iterate(problem: Problem, search: _Search, counts: Tensor, config: LmConfig) -> tuple[_Search, Bool[Tensor, "b"]]:

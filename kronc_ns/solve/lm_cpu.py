@@ -54,14 +54,17 @@ def adjust_scenes(
     iterations: int,
     tolerance: float,
     inlier: Array,  # out [B, N, J]
-    losses: Array,  # out [iterations], cost of the first scene after every step
+    losses: Array,  # out [B, iterations], cost after every step
+    rotations: Array,  # out [B, S, N, 3, 3], the first S steps
+    translations: Array,  # out [B, S, N, 3]
 ) -> Array:
     """`lm.adjust` of every scene: rows of sigma, cost in squared pixels, shape weight, steps, converged."""
     found = np.empty((len(uv), 5))
     for b in range(len(uv)):
         found[b] = _adjust(
             rotation[b], translation[b], points[b], uv[b], weight[b], focal[b], redundancy[b], most_sigma[b], mean,
-            precision, freedom, points_known, iterations, tolerance, inlier[b], losses[: 0 if b else None],
+            precision, freedom, points_known, iterations, tolerance, inlier[b], losses[b],
+            rotations[b], translations[b],
         )  # fmt: skip
     return found.T
 
@@ -212,7 +215,7 @@ def _camera_covariance(
 def _adjust(
     to_rotation: Any, to_translation: Any, to_points: Any, uv: Any, weight: Any, focal: Any, redundancy: Any,
     most_sigma: Any, mean: Any, precision: Any, freedom: Any, points_known: Any, iterations: Any, tolerance: Any,
-    inlier: Any, losses: Any,
+    inlier: Any, losses: Any, rotations: Any, translations: Any,
 ) -> Any:  # fmt: skip
     """One scene: sigma, cost, weight of the shape prior, steps, converged."""
     first, joint, measured, own = detections(uv, weight)
@@ -283,20 +286,27 @@ def _adjust(
                 phase, sigma, done = _next_phase(norm, sigma, phase, shrunk, redundancy)
                 done = done or rounds >= ROUNDS
             cost = _cost(norm, sigma, phase, surprise, freedom, size if with_prior else 0)
-        if len(losses):
-            losses[step - 1] = cost
+        losses[step - 1] = cost
+        if step <= len(rotations):
+            _copy_poses(rotation, translation, rotations[step - 1], translations[step - 1])
     usual = min(1.0, (freedom + size) / (freedom + surprise)) if with_prior else 1.0
+    _copy_poses(rotation, translation, to_rotation, to_translation)
     for n in range(views):
-        for p in range(3):
-            to_translation[n, p] = translation[n, p]
-            for q in range(3):
-                to_rotation[n, p, q] = rotation[n, p, q]
         for k in range(first[n], first[n + 1]):
             inlier[n, joint[k]] = norm[k] <= TRIM_SIGMAS * sigma
     for j in range(joints):
         for c in range(3):
             to_points[j, c] = points[j, c]
     return sigma, cost, usual, float(step), 1.0 if done else 0.0
+
+
+@compiled
+def _copy_poses(rotation: Any, translation: Any, to_rotation: Any, to_translation: Any) -> None:
+    for n in range(len(rotation)):
+        for p in range(3):
+            to_translation[n, p] = translation[n, p]
+            for q in range(3):
+                to_rotation[n, p, q] = rotation[n, p, q]
 
 
 @compiled

@@ -75,6 +75,8 @@ class Solution:
     median_px: float
     """Median reprojection error over all detections in solved views."""
     history: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    path: Float[Tensor, "s n 3 4"] | None = None
+    """Where the cameras were at steps on the way, each in a frame of its own; NaN for views that took no part."""
 
     @property
     def solved(self) -> tuple[bool, ...]:

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from kronc_ns.report.overlays import load_image, overlay, overlay_svg
 from kronc_ns.scene import Scene
 from kronc_ns.solve.solution import Solution, ViewReport, ViewStatus
-from kronc_ns.stages import aligned_start, between
+from kronc_ns.stages import aligned_path, on_path
 from kronc_ns.verify import inliers
 from kronc_ns.viewer import colours
 from kronc_ns.viewer.cameras import Cameras
@@ -38,7 +38,7 @@ class Viewer:
     def __init__(self, server: "viser.ViserServer", scene: Scene, solution: Solution, folder: Path) -> None:
         self.server = server
         self._scene, self._solution, self._folder = scene, solution, folder
-        self._before = aligned_start(solution)
+        self._path = aligned_path(solution)
         _, self._inlier = inliers(scene, solution)
         self._closed, self._lock = threading.Event(), threading.RLock()
         self._share, self.selected = 1.0, -1
@@ -80,7 +80,7 @@ class Viewer:
             if share == self._share:
                 return
             self._share = share
-            self.cameras.move(between(self._before, self._solution.c2w, share))
+            self.cameras.move(on_path(self._path, share))
             if self.selected in self.cameras.views:
                 self.car.move_rays(*self.cameras.pose(self.selected))
 
@@ -92,7 +92,7 @@ class Viewer:
             self._slider = gui.add_slider("before – after", min=0.0, max=1.0, step=0.01, initial_value=1.0)
             self._slider.on_update(lambda _: self.show(self._slider.value))
             gui.add_button("Play").on_click(lambda _: self._play())
-            gui.add_markdown(f"From {plain(solution.init)} poses, on straight lines: steps between are not recorded.")
+            gui.add_markdown(_way_text(solution, len(self._path) - 2))
         with gui.add_folder("Show"):
             self._by = gui.add_dropdown("camera colour", ("status", "residual"), initial_value="status")
             self._legend = self._add_picture()
@@ -208,6 +208,13 @@ def summary_text(solution: Solution, title: str) -> str:
     if failed:
         lines.append(f"{failed} without a pose, which are not drawn")
     return "  \n".join(lines)
+
+
+def _way_text(solution: Solution, recorded: int) -> str:
+    """Markdown that says what the slider goes through."""
+    steps = solution.iterations
+    over = f"over {'all' if recorded == steps else f'{recorded} of'} {steps} steps" if recorded else "on straight lines"
+    return f"From {plain(solution.init)} poses, {over}."
 
 
 def view_text(view: ViewReport, has_image: bool) -> str:
