@@ -61,8 +61,12 @@ class KroncConfig:
         for name, value in positive.items():
             if not 0 < value < math.inf:
                 raise KroncError(f"{name} is {value}: expected a finite number above 0")
-        if min(self.adam.weight_2d, self.adam.weight_3d) < 0 or self.adam.weight_2d + self.adam.weight_3d <= 0:
-            raise KroncError("adam.weight_2d and adam.weight_3d must not be negative, and not both be 0")
+        weights = self.adam.weight_2d, self.adam.weight_3d
+        if not all(0 <= weight < math.inf for weight in weights) or sum(weights) <= 0:
+            raise KroncError(
+                f"adam.weight_2d and adam.weight_3d are {weights[0]:g} and {weights[1]:g}: "
+                "expected finite numbers from 0 on, and not both 0"
+            )
         if self.solver == "adam" and (self.refine_focal or self.refine_k1):
             raise KroncError('refine_focal and refine_k1 need solver "lm": adam takes the intrinsics as given')
         if self.solver == "lm" and self.depth_init != "random":

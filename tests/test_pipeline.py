@@ -216,8 +216,9 @@ def test_impossible_options_are_refused():
     ):
         with pytest.raises(KroncError):
             KroncConfig(**change)
-    with pytest.raises(KroncError, match="not both be 0"):
-        KroncConfig(solver="adam", adam=AdamConfig(weight_2d=0.0, weight_3d=0.0))
+    for weights in ((0.0, 0.0), (-1.0, 1.0), (math.nan, 1.0), (1.0, math.inf)):
+        with pytest.raises(KroncError, match="not both 0"):
+            KroncConfig(solver="adam", adam=AdamConfig(weight_2d=weights[0], weight_3d=weights[1]))
 
 
 def test_car_axes_follow_the_car():
