@@ -58,7 +58,7 @@ def test_starts_are_solved_together_as_they_are_alone(lap, lap_start):
 def test_another_solvers_result_is_measured_alike(lap, lap_start):
     scene = scene_of(lap)
     (ours,) = adjust_starts([start_from_poses("given", scene, lap_start)], CONFIG)
-    theirs = measured(ours.start, ours.initial_c2w, 3, {})
+    theirs = measured(ours.start, ours.initial_c2w, 3, {}, ours.path)
     assert theirs.sigma_px == pytest.approx(ours.sigma_px, rel=0.25)
     assert (theirs.inlier == ours.inlier).double().mean() > 0.99
     ratio = theirs.covariance.diagonal(dim1=1, dim2=2).sqrt() / ours.covariance.diagonal(dim1=1, dim2=2).sqrt()
