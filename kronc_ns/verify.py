@@ -92,7 +92,7 @@ def verify(scene: Scene, solution: Solution, evidence: Evidence) -> tuple[list[V
     total = float((torch.where(kept, error.square(), 0.0).sum() / kept.sum().clamp_min(1)).sqrt())
     measured = error[error.isfinite()]
     overall = float(measured.median()) if len(measured) else math.inf
-    status, reason = _judge(scene, solution, solved, overall, evidence)
+    status, reason = _judge(scene, solution, solved, kept, overall, evidence)
     return reports, status, reason, total, median
 
 
@@ -126,7 +126,12 @@ def _known(value: float) -> float | None:
 
 
 def _judge(
-    scene: Scene, solution: Solution, solved: Bool[Tensor, "n"], median_px: float, evidence: Evidence
+    scene: Scene,
+    solution: Solution,
+    solved: Bool[Tensor, "n"],
+    kept: Bool[Tensor, "n j"],
+    median_px: float,
+    evidence: Evidence,
 ) -> tuple[Status, str]:
     share = median_px / math.hypot(scene.camera.width, scene.camera.height)
     count, views = int(solved.sum()), len(scene)
@@ -143,6 +148,8 @@ def _judge(
         problems.append(f"the solver was still moving after {solution.iterations} steps: allow more")
     if count < MIN_VIEWS:
         problems.append(f"only {count} views: nothing but the car template holds them together")
+    elif not _redundant(kept):
+        problems.append("the views share so few keypoints that any poses would meet them: take more views")
     if share > POOR_FIT / 2:
         problems.append("the keypoints fit poorly")
     if 2 * count < views:
@@ -156,6 +163,13 @@ def _judge(
     if problems:
         return Status.WEAK, f"{'; '.join(problems)}; {fit}"
     return Status.CONVERGED, f"{count} of {views} views solved; {fit}"
+
+
+def _redundant(kept: Bool[Tensor, "n j"]) -> bool:
+    """Whether the detections that agree are more than what they determine: poses and points, but for the gauge."""
+    shared = kept & (kept.sum(0) >= 2)
+    views, points = int(shared.any(1).sum()), int(shared.any(0).sum())
+    return 2 * int(shared.sum()) > 6 * views + 3 * points - 7
 
 
 def _parallax_deg(solution: Solution, solved: Bool[Tensor, "n"]) -> float:

@@ -6,9 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from kronc_ns.geometry.camera import project
+from kronc_ns.geometry.poses import invert, transform
 from kronc_ns.pipeline import KroncConfig, solve_scene
 from kronc_ns.scene import Scene
 from kronc_ns.solve.solution import Solution, Status, ViewStatus
+from kronc_ns.synthetic.scenes import make_capture
 from kronc_ns.verify import Evidence, inliers, residuals_px, verify
 from tests.conftest import scene_of
 
@@ -149,3 +152,21 @@ def test_points_behind_a_camera_are_no_inliers(scene, true):
     assert reports[2].status is ViewStatus.FAILED
     assert reports[2].inliers == 0
     assert reports[2].visible == int(scene.visibility[2].sum())
+
+
+def test_poses_that_nothing_checks_are_weak():
+    """Three views of which each pair shares three points: 36 numbers were measured, 38 are sought."""
+    capture = make_capture("walk", views=3, seed=3, missing=0.0)
+    car = torch.arange(9)
+    keypoints = torch.zeros_like(capture.keypoints)
+    in_camera = transform(invert(capture.c2w), capture.points.expand(3, -1, -1))
+    for view, points in enumerate((car[:6], car[3:], car[[0, 1, 2, 6, 7, 8]])):
+        keypoints[view, points, :2] = project(in_camera, capture.camera)[view, points]
+        keypoints[view, points, 2] = 1.0
+    solution = solve_scene(scene_of(replace(capture, keypoints=keypoints)), KroncConfig(init="circular"))
+    assert solution.status is not Status.CONVERGED
+    given = replace(scene_of(replace(capture, keypoints=keypoints)), given_c2w=capture.c2w)
+    solution = solve_scene(given, KroncConfig(init="given"))
+    assert solution.median_px < 0.05
+    assert solution.status is Status.WEAK
+    assert "share so few keypoints" in solution.reason
