@@ -60,11 +60,13 @@ def upright_size(path: Path, orient: bool = True) -> tuple[int, int]:
 def copy_upright(source: Path, target: Path, orient: bool = True) -> Image.Image:
     """Copy a photo with its EXIF orientation applied; byte for byte where there is none. Returns the image.
 
-    A photo of another format than ``target`` (HEIF, which few programs read) is coded anew.
+    HEIF, which few programs read, is coded anew in the format of ``target``.
     """
     image = load_image(source)
-    if (orient and is_turned(image)) or source.suffix.lower() != target.suffix.lower():
-        upright = ImageOps.exif_transpose(image) if orient else image
+    if (orient and is_turned(image)) or source.suffix.lower() in HEIF_SUFFIXES:
+        upright = ImageOps.exif_transpose(image)
+        if source.suffix.lower() in HEIF_SUFFIXES:
+            upright = upright.convert("RGB")  # JPEG has no alpha
         options: dict[str, Any] = (
             {"quality": 95, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
         )

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from typing_extensions import assert_never
 
+from kronc_ns.geometry.poses import invert, make_pose
 from kronc_ns.solve import lm_cpu
 from kronc_ns.solve.bundle import eliminate_cameras, linearise, move, orbit_error, residuals, solve_step
 from kronc_ns.solve.lm_cpu import (
@@ -32,7 +33,7 @@ from kronc_ns.solve.lm_cpu import (
     TRIM_SIGMAS,
     TRIMMED,
 )
-from kronc_ns.solve.problem import Batched, Problem, Residuals, ShapePrior, State, array, poses_of
+from kronc_ns.solve.problem import Batched, Problem, Residuals, ShapePrior, State, array
 from kronc_ns.solve.threads import aside
 
 _HUBER_SIGMAS = 2.0
@@ -80,7 +81,7 @@ class LmResult:
     def path(self, scene: int) -> Float[Tensor, "s n 3 4"]:
         """Poses (c2w) of a scene after each step, in the gauge of the solver."""
         steps = int(self.iterations[scene])
-        return poses_of(self.rotations[scene, :steps], self.translations[scene, :steps])
+        return invert(make_pose(self.rotations[scene, :steps], self.translations[scene, :steps]))
 
 
 @dataclass(frozen=True)

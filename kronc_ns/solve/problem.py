@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from kronc_ns.geometry.poses import invert, make_pose
+
 Record = TypeVar("Record", bound="Batched")
 
 
@@ -106,7 +108,7 @@ class State(Batched):
     @property
     def c2w(self) -> Float[Tensor, "b n 3 4"]:
         """Camera poses."""
-        return poses_of(self.rotation, self.translation)
+        return invert(make_pose(self.rotation, self.translation))
 
     @staticmethod
     def of(c2w: Float[Tensor, "b n 3 4"], points: Float[Tensor, "b j 3"], unknown: int = 0) -> "State":
@@ -131,12 +133,6 @@ class Residuals(Batched):
     """Squared Mahalanobis distance of the points under the shape prior; 0 without one."""
     pull: Float[Tensor, "b p"]
     """Half its gradient by the points."""
-
-
-def poses_of(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 4"]:
-    """Camera poses (c2w) of what leads from the world to the camera."""
-    inverse = rotation.transpose(-1, -2)
-    return torch.cat([inverse, -inverse @ translation[..., None]], dim=-1)
 
 
 def focal_of(problem: Problem, state: State) -> Float[Tensor, "b 2"]:

@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 import trimesh
 from jaxtyping import Bool, Float
 
-from kronc_ns.geometry.camera import Camera
+from kronc_ns.geometry.camera import Camera, rays
 from kronc_ns.synthetic.car import CarModel
 from kronc_ns.synthetic.car_paint import METRES_PER_TEXEL
 from kronc_ns.synthetic.surroundings import SUN, shade_surroundings, sky_colour, surroundings_distance
@@ -68,7 +69,7 @@ def render_view(
     ground: bool,
     samples: int = 2,
 ) -> Rendering:
-    """Renders the car from a pinhole camera with samples x samples rays a pixel; `ground` adds the car park."""
+    """Renders the car from a camera with samples x samples rays a pixel; `ground` adds the car park."""
     width, height = camera.width, camera.height
     fine = camera.scaled(float(samples))
     colour = np.empty((height, width, 4), np.float32)
@@ -104,8 +105,8 @@ def trace_mask_and_depth(
 
 def _camera_rays(c2w: np.ndarray, camera: Camera, rows: np.ndarray) -> tuple[np.ndarray, float]:
     """Unit rays [rows * width, 3] in the world through pixel centres, and the angle of a pixel in radians."""
-    u, v = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy)
-    ray = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ c2w[:, :3].T
+    pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, rows + 0.5), -1).reshape(-1, 2)
+    ray = rays(camera.undistort(torch.from_numpy(pixels)), camera).numpy() @ c2w[:, :3].T
     return ray / np.linalg.norm(ray, axis=1, keepdims=True), 1 / min(camera.fx, camera.fy)
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.synthetic.car import CarModel, build_car
 from kronc_ns.synthetic.car_parts import CarShape
-from kronc_ns.synthetic.render import Rendering, keypoint_visibility, render_view
+from kronc_ns.synthetic.render import Rendering, keypoint_visibility, render_view, trace_mask_and_depth
+from kronc_ns.synthetic.scenes import default_camera, make_capture
 from kronc_ns.synthetic.surroundings import ground_levels, wall_levels
 
 SIZE, FOCAL = 96, 82.0
@@ -157,3 +160,16 @@ def test_principal_point_shifts_the_image(car: CarModel) -> None:
     centred = view(car, c2w, ground=True)
     moved = render_view(car, c2w, Camera(FOCAL, FOCAL, SIZE / 2 - 10, SIZE / 2 + 4, SIZE, SIZE), ground=True)
     np.testing.assert_array_equal(moved.rgba[4:, :-10], centred.rgba[:-4, 10:])
+
+
+@pytest.mark.parametrize("lens", [(-0.35, 0.12), (0.6, 0.3)])
+def test_a_lens_bends_the_image_as_it_does_the_keypoints(lens: tuple[float, float]) -> None:
+    camera = replace(default_camera("carpatch", 160), k1=lens[0], k2=lens[1])
+    capture = make_capture("carpatch", 6, seed=5, camera=camera)
+    assert isinstance(capture.car, CarModel)
+    for c2w, keypoints in zip(capture.c2w, capture.keypoints, strict=True):
+        mask, _ = trace_mask_and_depth(capture.car.mesh, c2w.numpy(), camera, ground=False)
+        near = cv2.dilate(mask, np.ones((3, 3), np.uint8))
+        seen = keypoints[:, 2] > 0
+        u, v = keypoints[seen, :2].floor().long().T.numpy()
+        assert (near[v, u] > 0).all()
