@@ -68,6 +68,12 @@ from kronc_ns.synthetic.scenes import Capture, make_capture
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """torch's global generator starts alike in every test."""
+    torch.manual_seed(0)
+
+
 @pytest.fixture(scope="session")
 def spin_suv() -> Path:
     """The real turntable capture beside the project."""

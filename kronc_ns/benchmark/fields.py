@@ -1,6 +1,7 @@
 """Fields trained on the poses of several methods, on the full frame and on the vehicle cut out."""
 
 import json
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -46,6 +47,8 @@ class FieldOptions:
     """Method of `ns-train`."""
     backgrounds: tuple[Literal["keep", "white"], ...] = ("keep", "white")
     """keep: trained and tested on the full frame; white: on the vehicle, cut out."""
+    downscale_factor: int = 1
+    """Train and test on images smaller by this factor (1, 2, 4 or 8); poses are found from the full size."""
     iterations: int | None = None
     """Training steps (default: the method's)."""
 
@@ -69,8 +72,9 @@ def make_field_table(options: FieldOptions) -> None:
         "## Fields on the poses of several methods\n\n"
         + "\n".join(f"| {' | '.join(line)} |" for line in lines)
         + "\n\nPSNR (dB) / SSIM of the full frame (of the vehicle) over the test views; keep: trained on the full "
-        f"frame, white: on the vehicle cut out. `{options.method}`, every 8th view for testing, {machine['cores']} "
-        f"cores ({machine['cpu']}), load {machine['load_1min'] or 0:.1f}; {seconds:.0f} s in all.\n"
+        f"frame, white: on the vehicle cut out; a dash: fewer than three views placed. `{options.method}`, images 1/"
+        f"{options.downscale_factor} in size, every 8th view for testing, {machine['cores']} cores "
+        f"({machine['cpu']}), load {machine['load_1min'] or 0:.1f}; {seconds:.0f} s in all.\n"
     )
     with atomic_path(options.output_dir / "fields.md") as path:
         path.write_text(text, encoding="utf-8")
@@ -80,25 +84,28 @@ def make_field_table(options: FieldOptions) -> None:
 
 def _row(subject: Subject, poses: PosesOf, options: FieldOptions, commands: Commands) -> dict[str, Any]:
     c2w, errors = _poses(subject, poses)
+    row = {"capture": subject.name, "poses": poses, "errors": errors, "results": {}}
+    placed = f"{100 * errors['registered']:.0f} %"
+    if math.isnan(errors["median_deg"]):
+        return {**row, "cells": [subject.name, poses, placed, "-", *("-" for _ in options.backgrounds)]}
     data = options.output_dir / subject.name / poses
     assert subject.folder is not None
     write_poses(data, subject.folder, subject.scene, c2w, subject.points)
     results: dict[str, Any] = {}
     steps = [] if options.iterations is None else ["--max-num-iterations", str(options.iterations)]
     for background in options.backgrounds:
-        parser = ["--background", background]
+        parser = ["--background", background, "--downscale-factor", str(options.downscale_factor)]
         config = train(data, options.method, data / "runs" / background, steps, parser, commands)
         pictures = data / "pictures" / background
         output = commands.run("kronc", "eval", "--nvs", str(config), "--pictures", str(pictures), "--json")
         results[background] = {name: json.loads(output)[name] for name in ("full", "masked")}
-    placed = f"{100 * errors['registered']:.0f} %"
     apart = f"{errors['median_deg']:.2f} deg, {errors['median_cm']:.1f} cm"
     cells = [subject.name, poses, placed, apart, *(_psnr(results[name]) for name in options.backgrounds)]
-    return {"capture": subject.name, "poses": poses, "errors": errors, "results": results, "cells": cells}
+    return {**row, "results": results, "cells": cells}
 
 
 def _poses(subject: Subject, poses: PosesOf) -> tuple[Float[Tensor, "n 3 4"], dict[str, float]]:
-    """Poses in the frame of the reference, and their errors."""
+    """Poses in the frame of the reference, and their errors (NaN below three views, which nothing aligns)."""
     if poses == "reference":
         c2w = subject.truth
     elif poses == "circle":
@@ -107,9 +114,8 @@ def _poses(subject: Subject, poses: PosesOf) -> tuple[Float[Tensor, "n 3 4"], di
     else:
         c2w = place(poses, subject, None, ADAM_FROM_CIRCLE if poses == "adam" else None).c2w
     posed = c2w.isfinite().all(-1).all(-1)
-    if int(posed.sum()) < 3:
-        raise KroncError(f"{poses} places {int(posed.sum())} views of {subject.name}: nothing to train on")
-    c2w = umeyama(c2w[posed][..., 3], subject.truth[posed][..., 3]).apply_to_poses(c2w)
+    if int(posed.sum()) >= 3:
+        c2w = umeyama(c2w[posed][..., 3], subject.truth[posed][..., 3]).apply_to_poses(c2w)
     return c2w, figures(Placed(c2w, 0.0, 0.0), subject)
 
 

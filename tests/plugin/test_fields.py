@@ -33,3 +33,12 @@ def test_a_field_on_true_poses_beats_one_on_the_circle(tmp_path):
     assert "| lap | kronc | 100 % |" in (tmp_path / "out" / "fields.md").read_text()
     with pytest.raises(KroncError, match="in use"):
         make_field_table(options)
+
+
+def test_a_peer_that_places_nothing_has_a_row_of_dashes(tmp_path):
+    capture = make_capture("walk", 4, 0)
+    write_capture(tmp_path / "four", capture)
+    make_field_table(
+        FieldOptions(output_dir=tmp_path / "out", captures=(tmp_path / "four",), poses=("keypoints-incremental",))
+    )
+    assert "| four | keypoints-incremental | 0 % | - | - | - | - |" in (tmp_path / "out" / "fields.md").read_text()
