@@ -1,7 +1,6 @@
 """What the commands share on a terminal: progress, the table of a solution, errors and exit statuses."""
 
 import errno
-import math
 import signal
 import statistics
 import sys
@@ -101,8 +100,9 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> Table:
         table.add_row("  left out", f"{view['file_path']}: {view['reason']}")
     if len(failed) > _LISTED:
         table.add_row("  left out", f"... and {len(failed) - _LISTED} more (kronc.json lists all)")
-    rmse, median = (math.nan if report[key] is None else report[key] for key in ("rmse_px", "median_px"))
-    table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {median:.2f} px of all")
+    rmse, median = report["rmse_px"], report["median_px"]
+    if rmse is not None and median is not None:
+        table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {median:.2f} px of all")
     sigmas = [[view[key] for view in views if view[key] is not None] for key in ("sigma_rot_deg", "sigma_trans_m")]
     if all(sigmas):
         rotation, centre = (statistics.median(values) for values in sigmas)

@@ -53,7 +53,8 @@ def evaluate_poses(
 ) -> PoseErrors:
     """Compare poses (OpenCV c2w by image path) with a reference; views are matched by file name.
 
-    Raises `KroncError` when file names are ambiguous or fewer than three views are in both.
+    Suffixes do not count: frame_00001.jpg may have been made of frame_00001.heic. Raises `KroncError` when file names
+    are ambiguous or fewer than three views are in both.
     """
     ours, theirs = _by_file_name(poses, "the poses"), _by_file_name(reference, "the reference")
     common = [name for name in theirs if name in ours]
@@ -71,7 +72,7 @@ def evaluate_poses(
 
 
 def _by_file_name(poses: Mapping[str, Float[Tensor, "3 4"]], what: str) -> dict[str, Tensor]:
-    named = {PurePosixPath(path).name: pose for path, pose in poses.items()}
+    named = {PurePosixPath(path).stem: pose for path, pose in poses.items()}
     if len(named) < len(poses):
         raise KroncError(f"two of {what} have the same file name: views are matched by file name")
     return named

@@ -15,7 +15,7 @@ import torch
 
 from kronc_ns import cli
 from kronc_ns.benchmark import paper
-from kronc_ns.benchmark.baselines import bundle_adjustment, triangulate
+from kronc_ns.benchmark.baselines import bundle_adjustment
 from kronc_ns.benchmark.commands import Commands
 from kronc_ns.benchmark.nvs_measures import Trainings, judge_exact, judge_solved
 from kronc_ns.benchmark.nvs_rows import METHODS, nvs_tasks
@@ -93,14 +93,6 @@ def test_the_oracle_leaves_outliers_and_empty_views_alone():
     blind = bundle_adjustment(capture_scene(capture), capture.c2w, capture.points)
     mean = [pose_errors(c2w[~empty], capture.c2w[~empty])[0].mean() for c2w in (best, blind.c2w)]
     assert mean[0] < 1.0 < mean[1]
-
-
-def test_triangulation_of_exact_keypoints_is_exact():
-    capture = make_capture("walk", views=10, seed=2)
-    scene = capture_scene(capture)
-    used = (scene.visibility > 0) & (scene.visibility.sum(0) >= 2)
-    found = triangulate(scene, capture.c2w, used)
-    torch.testing.assert_close(found[used.any(0)], capture.points[used.any(0)], atol=1e-9, rtol=0)
 
 
 def test_figures_of_the_truth_are_zero_and_its_ratio_is_of_common_views():

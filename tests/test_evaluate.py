@@ -94,8 +94,9 @@ def test_views_the_reference_lacks_do_not_count(truth):
     assert (errors.views, errors.registered) == (5, 5)
 
 
-def test_views_are_matched_by_file_name_in_any_folder_and_order(truth):
-    elsewhere = dict(reversed(named(turned(truth, [0, 0, 0, 0, 0, 0, 0, 9.0]), "../../photos").items()))
+def test_views_are_matched_by_file_name_in_any_folder_order_and_format(truth):
+    moved = named(turned(truth, [0, 0, 0, 0, 0, 0, 0, 9.0]), "../../photos")
+    elsewhere = {name.replace(".png", ".jpg"): pose for name, pose in reversed(moved.items())}
     errors = evaluate_poses(elsewhere, named(truth))
     assert errors.rotation_deg[7] == pytest.approx(9.0)
     assert errors.rotation_deg[:7].max() == pytest.approx(0, abs=1e-6)

@@ -6,7 +6,8 @@ import torch
 from kronc_ns.geometry.camera import rays
 from kronc_ns.geometry.poses import compose, invert, transform
 from kronc_ns.geometry.rotations import so3_log
-from kronc_ns.init import circular_poses, mean_distance, noisy_poses, prior_depths, random_depths
+from kronc_ns.init import circular_poses, mean_distance, noisy_poses, prior_depths, random_depths, triangulate
+from kronc_ns.synthetic.scenes import make_capture
 
 
 def azimuths(c2w: torch.Tensor) -> torch.Tensor:
@@ -67,3 +68,13 @@ def test_prior_depths_are_scaled_to_the_trajectory(walk_capture):
     assert ratio.std() < 1e-9  # one factor for all
     assert float((ratio * given[m > 0]).median()) == pytest.approx(8.0, rel=0.35)
     torch.testing.assert_close(prior_depths(given * math.nan, c2w, directions, m, fallback), fallback)
+
+
+def test_triangulation_of_exact_keypoints_is_exact():
+    capture = make_capture("walk", views=10, seed=2)
+    seen = capture.keypoints[..., 2] > 0
+    found = triangulate(capture.c2w, rays(capture.keypoints[..., :2], capture.camera), seen.double())
+    known = seen.sum(0) >= 2
+    torch.testing.assert_close(found[known], torch.as_tensor(capture.points)[known], atol=1e-7, rtol=0)
+    never = seen.sum(0) == 0
+    torch.testing.assert_close(found[never], capture.c2w[..., 3].mean(0).expand(int(never.sum()), 3), atol=1e-6, rtol=0)

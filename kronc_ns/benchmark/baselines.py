@@ -11,6 +11,7 @@ from torch import Tensor
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import rays
 from kronc_ns.geometry.poses import invert
+from kronc_ns.init import triangulate
 from kronc_ns.scene import Scene
 
 Loss = Literal["trivial", "cauchy"]
@@ -31,14 +32,6 @@ class Adjustment:
     seconds: float
     """Time of the adjustment alone, without building pycolmap's model of the scene."""
     converged: bool
-
-
-def triangulate(scene: Scene, c2w: Float[Tensor, "n 3 4"], used: Bool[Tensor, "n j"]) -> Float[Tensor, "j 3"]:
-    """The point nearest to all rays to each keypoint, in the least-squares sense; a linear system a point."""
-    direction = torch.nn.functional.normalize(rays(scene.uv, scene.camera), dim=-1) @ c2w[..., :3].transpose(-1, -2)
-    across = torch.eye(3, dtype=c2w.dtype) - direction[..., :, None] * direction[..., None, :]
-    across = torch.where(used[..., None, None], across, 0.0)
-    return torch.linalg.lstsq(across.sum(0), (across @ c2w[:, None, :, 3:]).sum(0)).solution[..., 0]
 
 
 def bundle_adjustment(
@@ -63,7 +56,7 @@ def bundle_adjustment(
     used = (scene.visibility > 0) if used is None else used & (scene.visibility > 0)
     used = used & (used.sum(1, keepdim=True) >= _LEAST_POINTS)
     used = used & (used.sum(0) >= 2)
-    points = triangulate(scene, c2w, used) if points is None else points
+    points = triangulate(c2w, rays(scene.uv, scene.camera), used.to(c2w)) if points is None else points
     model = _model(scene, c2w, points, used)
     options = pycolmap.BundleAdjustmentOptions()
     if not hasattr(options, "ceres"):

@@ -137,7 +137,10 @@ class KroncDataParser(DataParser):
         masks = [factor.path(scene.masks[i]) for i in indices] if scene.masks else None
         missing = [path for path in [*images, *(masks or [])] if not path.exists()]
         if missing:
-            raise KroncError(f"{missing[0]} does not exist: training needs the images ({len(missing)} are missing)")
+            remedy = "" if factor.factor == 1 else "; `ns-process-data kronc` writes those of 1/2, 1/4 and 1/8"
+            raise KroncError(
+                f"{missing[0]} does not exist: training needs the images ({len(missing)} are missing){remedy}"
+            )
         if masks is not None and config.background != "keep":
             check_masks(masks)
         seeds = grey(points)
