@@ -95,7 +95,7 @@ def _run(
 
     def solve() -> tuple[Problem, LmResult]:
         problem, state = _problem(starts, views, refine, shape_prior(starts[0].scene.schema))
-        problem = problem.each(lambda t: t.to(device))
+        problem = problem.to(device)
         return problem, adjust(problem, state.each(lambda t: t.to(device)), config.lm, progress)
 
     problem, result = solve()

@@ -78,7 +78,7 @@ class SolverOptions:
     """Initial depths of adam: random as in the paper, or a prior (then optimised, or kept as it is): the depth maps of
     transforms.json, else what DINOv2 estimates from the images, scaled to the initial poses."""
     device: Literal["auto", "cpu", "cuda"] | None = None
-    """Where to solve; auto takes a GPU when there is one."""
+    """Where to solve; auto takes a GPU for adam when there is one (lm is faster on the CPU)."""
     seed: int | None = None
     """Seed of the random depths."""
 

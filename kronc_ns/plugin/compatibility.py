@@ -18,7 +18,7 @@ def allow_numpy_in_checkpoints() -> None:
     nerfstudio 1.1.5 does not say ``weights_only=False`` (its issue 3683), which is the default since torch 2.6; the
     learning rates its schedulers save are NumPy floats. Nothing but these types is allowed.
     """
-    if not hasattr(torch.serialization, "add_safe_globals"):  # torch < 2.5 loads everything
+    if torch.__version__ < "2.6":  # loads everything
         return
     multiarray = np.core.multiarray if np.__version__ < "2" else np._core.multiarray  # pyright: ignore[reportAttributeAccessIssue]
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")

@@ -18,7 +18,7 @@ from torch import Tensor
 from kronc_ns.console import exit_on_error
 from kronc_ns.errors import KroncError
 
-_STEPS, _RATE, _RATE_FINAL = 60, 2e-3, 1e-4  # of a test pose: radians, and units of the scene
+_STEPS, _RATE, _RATE_FINAL = 60, 2e-3, 1e-4  # of a test pose: radians, and shares of the distance to the car
 _RAYS = 512
 _LOOK_EVERY = 100  # steps: what is drawn without what is NaN has a finite loss
 _LOST = (
@@ -95,12 +95,16 @@ def refined_pose(
     whole images only) on the image; where there is a mask, on its pixels.
     """
     adjustment = CameraOptimizerConfig(mode="SO3xR3").setup(num_cameras=1, device=str(camera.device))
-    optimizer = torch.optim.Adam(adjustment.parameters(), lr=_RATE)
+    unit = torch.ones(6, device=camera.device)
+    unit[:3] = camera.camera_to_worlds[0, :3, 3].norm()  # the dataparser puts the car at the origin
+    change = torch.zeros(1, 6, device=camera.device)
+    optimizer = torch.optim.Adam([change], lr=_RATE)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (_RATE_FINAL / _RATE) ** (1 / _STEPS))
     moved = copy.copy(camera)
     moved.metadata = {"cam_idx": 0}  # the optimiser's only one
     original = moved.camera_to_worlds
     usable = batch["mask"][..., 0] if "mask" in batch else torch.ones(batch["image"].shape[:2])
+    usable = usable.to(batch["image"].device)  # nerfstudio moves masks to the model, but not always images
     pixels = usable.nonzero()
     if not len(pixels):
         return original[0]
@@ -116,8 +120,9 @@ def refined_pose(
             target = {"image": batch["image"][rows, columns]}
         loss = torch.stack(list(model.get_loss_dict(outputs, target).values())).sum()
         (gradient,) = torch.autograd.grad(loss, [adjustment.pose_adjustment])
-        adjustment.pose_adjustment.grad = gradient
+        change.grad = gradient * unit
         optimizer.step()
         schedule.step()
+        adjustment.pose_adjustment.data = change * unit
     moved.camera_to_worlds = original
     return adjustment.apply_to_camera(moved)[0].detach()

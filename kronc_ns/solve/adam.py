@@ -199,7 +199,8 @@ def minimise(
     """
     start = time.perf_counter()
     gradient = LossGradient(c2w, depths, uv, m, focal, principal, (config.weight_3d, config.weight_2d))
-    optimiser = torch.optim.Adam([gradient.parameters], lr=config.learning_rate, fused=True)
+    fused = c2w.is_cuda or torch.__version__ >= "2.4"
+    optimiser = torch.optim.Adam([gradient.parameters], lr=config.learning_rate, fused=fused)
     report_every = max(1, config.steps // 100)
     history: dict[str, list[float]] = {"step": [], "loss": []}
     path: list[Tensor] = []

@@ -55,6 +55,10 @@ class ShapePrior:
         order = torch.arange(mean.numel(), device=mean.device).view(-1, 3).T.flatten()
         return ShapePrior(mean.T.flatten(), precision[order][:, order].contiguous())
 
+    def to(self, device: torch.device) -> "ShapePrior":
+        """The same on a device."""
+        return replace(self, mean=self.mean.to(device), precision=self.precision.to(device))
+
     @staticmethod
     def nothing(like: Tensor) -> "ShapePrior":
         """What the compiled loops take for no prior."""
@@ -85,6 +89,11 @@ class Problem(Batched):
     """Shared intrinsics that are unknown too."""
     points_known: bool = False
     """Whether only the cameras are sought (resection)."""
+
+    def to(self, device: torch.device) -> "Problem":
+        """The same on a device, the prior that all scenes share included."""
+        shape = None if self.shape is None else self.shape.to(device)
+        return replace(self.each(lambda x: x.to(device)), shape=shape)
 
     @property
     def plain(self) -> bool:

@@ -11,7 +11,10 @@ _local = threading.local()
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute on one CPU thread: the tensors are too small to share, and idle threads would only spin for the cores."""
+    """Compute on one CPU thread: the tensors are too small to share, and idle threads would only spin for the cores.
+
+    So do threads that begin meanwhile.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -5,7 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
+from kronc_ns.geometry import rotations
 from kronc_ns.geometry.rotations import skew
 from kronc_ns.solve.bundle import (
     Linearisation,
@@ -18,6 +20,7 @@ from kronc_ns.solve.bundle import (
     solve_step,
 )
 from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State
+from kronc_ns.solve.uncertainty import camera_covariance
 from tests.solve.problems import SIMILARITY, moved, randn, scene, started
 
 VIEWS, JOINTS = 4, 6
@@ -283,3 +286,20 @@ def test_the_prior_of_a_shape_is_reordered_with_its_covariance():
     planar = (mean + offset).T.flatten() - prior.mean
     expected = offset.flatten() @ (root @ root.T / JOINTS) @ offset.flatten()
     torch.testing.assert_close(planar @ prior.precision @ planar, expected)
+
+
+@pytest.mark.parametrize("variant", ["plain", "everything"])
+def test_a_step_and_its_covariance_stay_on_one_gpu(variant, monkeypatch):
+    """Fake tensors know their device though there is none: mixing it with another raises."""
+    monkeypatch.setattr(rotations, "_generators", rotations._generators.__wrapped__)  # no fake one is to be kept
+    problem, truth, _, _ = systems(variant, batch=2)
+    problem = replace(problem, shape=shape_prior(problem.uv.shape[3]))
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        gpu = torch.device("cuda")
+        problem, state = problem.to(gpu), truth.each(lambda x: x.to(gpu))
+        one = torch.ones(2, dtype=torch.float64, device=gpu)
+        system = linearise(problem, state, residuals(problem, state), problem.weight, one, one)
+        state = move(state, solve_step(eliminate_cameras(system, one), problem.uv.shape[3]))
+        covariance = camera_covariance(problem, state, problem.weight > 0, one, one)
+        for result in (state.points, state.c2w, covariance):
+            assert result.device.type == "cuda"

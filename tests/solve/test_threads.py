@@ -1,6 +1,7 @@
 """Threads take turns, but for what needs no interpreter."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
@@ -10,8 +11,13 @@ from kronc_ns.solve.threads import aside, one_thread, turn
 def test_one_thread_gives_back_what_there_was():
     threads = torch.get_num_threads()
     with one_thread():
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == threads
+        assert torch.get_num_threads() == in_another_thread() == 1
+    assert torch.get_num_threads() == in_another_thread() == threads
+
+
+def in_another_thread() -> int:
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(torch.get_num_threads).result()
 
 
 def test_another_thread_has_its_turn_only_while_the_first_is_aside():
