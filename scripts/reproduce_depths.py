@@ -5,6 +5,8 @@ import tyro
 
 from kronc_ns.benchmark.settings import by_depths
 from kronc_ns.benchmark.tables import TableOptions, make_table
+from kronc_ns.console import exit_on_error
 
 if __name__ == "__main__":
-    make_table("depths", "By where the depths begin", tyro.cli(TableOptions, description=__doc__), by_depths)
+    with exit_on_error():
+        make_table("depths", "By where the depths begin", tyro.cli(TableOptions, description=__doc__), by_depths)

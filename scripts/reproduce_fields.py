@@ -4,6 +4,8 @@
 import tyro
 
 from kronc_ns.benchmark.fields import FieldOptions, make_field_table
+from kronc_ns.console import exit_on_error
 
 if __name__ == "__main__":
-    make_field_table(tyro.cli(FieldOptions, description=__doc__))
+    with exit_on_error():
+        make_field_table(tyro.cli(FieldOptions, description=__doc__))

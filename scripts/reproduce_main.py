@@ -5,8 +5,10 @@ import tyro
 
 from kronc_ns.benchmark.settings import main
 from kronc_ns.benchmark.tables import TableOptions, make_table
+from kronc_ns.console import exit_on_error
 
 if __name__ == "__main__":
-    make_table(
-        "main", "From the paper's noise, and without any start", tyro.cli(TableOptions, description=__doc__), main
-    )
+    with exit_on_error():
+        make_table(
+            "main", "From the paper's noise, and without any start", tyro.cli(TableOptions, description=__doc__), main
+        )

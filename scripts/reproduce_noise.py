@@ -5,6 +5,8 @@ import tyro
 
 from kronc_ns.benchmark.settings import by_noise
 from kronc_ns.benchmark.tables import TableOptions, make_table
+from kronc_ns.console import exit_on_error
 
 if __name__ == "__main__":
-    make_table("noise", "By the noise of the initial poses", tyro.cli(TableOptions, description=__doc__), by_noise)
+    with exit_on_error():
+        make_table("noise", "By the noise of the initial poses", tyro.cli(TableOptions, description=__doc__), by_noise)

@@ -5,6 +5,8 @@ import tyro
 
 from kronc_ns.benchmark.settings import by_views
 from kronc_ns.benchmark.tables import TableOptions, make_table
+from kronc_ns.console import exit_on_error
 
 if __name__ == "__main__":
-    make_table("views", "By the number of views", tyro.cli(TableOptions, description=__doc__), by_views)
+    with exit_on_error():
+        make_table("views", "By the number of views", tyro.cli(TableOptions, description=__doc__), by_views)

@@ -11,6 +11,7 @@ import torch
 import tyro
 
 from kronc_ns.benchmark import settings
+from kronc_ns.benchmark.baselines import bundle_adjustment
 from kronc_ns.benchmark.colmap import map_images, map_keypoints
 from kronc_ns.benchmark.memory import with_peak
 from kronc_ns.benchmark.peers import Placed, figures, place
@@ -33,6 +34,34 @@ def test_points_of_exact_keypoints_are_the_car_s():
     subject = procedural(5, "walk", views=12)
     seen = subject.scene.visibility.sum(0) >= 2
     assert torch.allclose(subject.points[seen], capture.points[seen], atol=1e-6)
+
+
+def test_points_that_fewer_than_two_views_see_are_unknown(subject):
+    keypoints = subject.scene.keypoints.clone()
+    keypoints[:, 0] = keypoints[1:, 1] = 0
+    lost = replace(subject, scene=replace(subject.scene, keypoints=keypoints))
+    assert lost.points[:2].isnan().all()
+
+
+@pytest.mark.parametrize(("unit", "factor"), [(1.0, 1.0), (1.2, 1.2), (0.2, 1.0), (7.0, 1.0)])
+def test_a_reference_in_which_a_car_has_no_car_s_size_is_scaled_to_metres(tmp_path, unit, factor):
+    capture = make_capture("walk", 12, 5)
+    stretched = capture.c2w.clone()
+    stretched[..., 3] *= unit
+    write_capture(tmp_path / "scene", replace(capture, c2w=stretched))
+    radius = from_folder(tmp_path / "scene").truth[..., 3].norm(dim=-1) / (factor * capture.c2w[..., 3].norm(dim=-1))
+    assert radius.std() < 1e-6
+    assert float(radius.mean()) == pytest.approx(1.0, abs=1e-6 if unit == factor else 0.1)
+
+
+def test_bundle_adjustment_has_both_focal_lengths(subject):
+    pytest.importorskip("pycolmap", minversion="4.1")
+    camera = replace(subject.scene.camera, fy=1.02 * subject.scene.camera.fy)
+    squeezed = subject.scene.keypoints.clone()
+    squeezed[..., 1] = camera.cy + 1.02 * (squeezed[..., 1] - camera.cy)
+    scene = replace(subject.scene, camera=camera, keypoints=squeezed)
+    found = bundle_adjustment(scene, noisy_poses(subject.truth, 1.0, 0.1, torch.Generator().manual_seed(0)))
+    assert figures(Placed(found.c2w, 1.0, 2.0), subject)["worst_deg"] < 0.01
 
 
 def test_noise_has_the_size_asked_for_and_moves_nothing_unseen(subject):

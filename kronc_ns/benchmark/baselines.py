@@ -99,11 +99,12 @@ def _model(scene: Scene, c2w: Tensor, points: Tensor, used: Tensor) -> Any:
 
     camera = scene.camera
     model = pycolmap.Reconstruction()
-    intrinsics = [camera.fx, camera.cx, camera.cy]  # one focal length, as our scenes have
+    kind, focal = "SIMPLE_PINHOLE", [camera.fx]
+    if camera.fx != camera.fy:
+        kind, focal = "PINHOLE", [camera.fx, camera.fy]
+    intrinsics = [*focal, camera.cx, camera.cy]
     model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            camera_id=1, model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=intrinsics
-        )
+        pycolmap.Camera(camera_id=1, model=kind, width=camera.width, height=camera.height, params=intrinsics)
     )
     uv, w2c = scene.uv.double().numpy(), invert(c2w).double().numpy()
     for i in torch.nonzero(used.any(1))[:, 0].tolist():

@@ -24,7 +24,7 @@ def map_images(scene: Scene, folder: Path, mapper: Mapper, masked: bool) -> Floa
 
     ``masked`` leaves out features on the background.
     """
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     with TemporaryDirectory(prefix="kronc_colmap_") as scratch:
         database = Path(scratch) / "database.db"
         reader = pycolmap.ImageReaderOptions(camera_model=_model(scene), camera_params=_parameters(scene))
@@ -44,7 +44,7 @@ def map_images(scene: Scene, folder: Path, mapper: Mapper, masked: bool) -> Floa
 
 def map_keypoints(scene: Scene, mapper: Mapper) -> Float[Tensor, "n 3 4"]:
     """Poses from keypoints of the same meaning as matches between all views that see eight or more of the same."""
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     with TemporaryDirectory(prefix="kronc_colmap_") as scratch:
         database = Path(scratch) / "database.db"
         seen = (scene.visibility > 0).numpy()
@@ -85,7 +85,7 @@ def _map(
     scene: Scene, database: Path, images: Path, mapper: Mapper, scratch: Path, few: bool
 ) -> Float[Tensor, "n 3 4"]:
     """Poses of the largest model that the mapper makes of a database; intrinsics stay as they are."""
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     models = scratch / "models"
     models.mkdir(exist_ok=True)
     if mapper == "incremental":
@@ -139,7 +139,8 @@ def _parameters(scene: Scene) -> str:
     return ",".join(map(str, values))
 
 
-def _pycolmap() -> Any:
+def load_pycolmap() -> Any:
+    """The module, silent but for errors."""
     import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
 
     import pycolmap

@@ -16,7 +16,7 @@ from torch import Tensor
 from typing_extensions import assert_never
 
 from kronc_ns.benchmark.baselines import bundle_adjustment
-from kronc_ns.benchmark.colmap import map_images, map_keypoints
+from kronc_ns.benchmark.colmap import load_pycolmap, map_images, map_keypoints
 from kronc_ns.benchmark.memory import with_peak
 from kronc_ns.benchmark.subjects import Subject
 from kronc_ns.errors import KroncError
@@ -51,9 +51,9 @@ class Placed:
     c2w: Float[Tensor, "n 3 4"]
     """NaN where a view has no pose."""
     seconds: float
-    """From keypoints or images to poses, initialisation included; of the second call where a method compiles itself."""
+    """From keypoints or images to poses, initialisation included, with everything loaded and compiled before."""
     megabytes: float
-    """Peak memory above what the process had before; NaN where the system does not tell."""
+    """Peak memory above what the process had before, libraries loaded; NaN where the system does not tell."""
 
 
 def place(
@@ -65,11 +65,12 @@ def place(
     settings of kronc and adam.
     """
     scene = replace(subject.scene, given_c2w=start)
+    warm_up = partial(_warm_up, method, scene, subject.folder, config)
     run = partial(_poses, method, scene, subject.folder, config)
     # spawned: forks of a process whose threads hold locks may never begin
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         try:
-            return pool.submit(_measured, run, method == "kronc").result()
+            return pool.submit(_measured, warm_up, run).result()
         except BrokenProcessPool:
             raise KroncError(f"{method} on {subject.name} ended its process: is there memory enough?") from None
 
@@ -106,10 +107,20 @@ def figures(placed: Placed, subject: Subject) -> dict[str, float]:
     }
 
 
-def _measured(run: Callable[[], Tensor], again: bool) -> Placed:
+def _warm_up(method: Method, scene: Scene, folder: Path | None, config: KroncConfig | None) -> None:
+    """What a method does once in a process only: compile itself, load libraries."""
+    if method in ("kronc", "ceres"):
+        _poses(method, scene, folder, config)
+    elif method == "adam":
+        config = config or KroncConfig()
+        _poses(method, scene, folder, replace(config, adam=replace(config.adam, steps=1)))
+    else:
+        load_pycolmap()
+
+
+def _measured(warm_up: Callable[[], None], run: Callable[[], Tensor]) -> Placed:
     """In the other process: poses, time and memory."""
-    if again:
-        run()
+    warm_up()
 
     def timed() -> tuple[Tensor, float]:
         begin = time.perf_counter()

@@ -8,11 +8,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from kronc_ns.errors import KroncError
+from kronc_ns.frame import template_frame
 from kronc_ns.geometry.camera import rays
 from kronc_ns.init import triangulate
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
+from kronc_ns.keypoints.template import car_template
 from kronc_ns.scene import Scene, load_scene, read_poses
 from kronc_ns.synthetic.scenes import Capture, Preset, make_capture
+
+_UNLIKE_A_CAR = 1.5
+"""No car is so many times larger or smaller than its proportions tell."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +32,9 @@ class Subject:
 
     @property
     def points(self) -> Float[Tensor, "j 3"]:
-        """Keypoints where true poses and detections see them."""
-        return triangulate(self.truth, rays(self.scene.uv, self.scene.camera), self.scene.visibility)
+        """Keypoints where true poses and detections see them; NaN where fewer than two views do."""
+        points = triangulate(self.truth, rays(self.scene.uv, self.scene.camera), self.scene.visibility)
+        return torch.where((self.scene.visibility.sum(0) >= 2)[:, None], points, torch.nan)
 
 
 def capture_scene(capture: Capture, given: Float[Tensor, "n 3 4"] | None = None) -> Scene:
@@ -44,7 +50,10 @@ def procedural(seed: int, preset: Preset = "carpatch", views: int = 100) -> Subj
 
 
 def from_folder(folder: Path) -> Subject:
-    """A scene folder with its reference.json; views without a reference are left out."""
+    """A scene folder with its reference.json; views without a reference are left out.
+
+    Where the reference cannot be in metres, the template says how large the car is.
+    """
     if not (folder / "reference.json").is_file():
         raise KroncError(f"{folder}: expected a scene folder with the true poses in reference.json")
     scene, reference = load_scene(folder), read_poses(folder / "reference.json")
@@ -53,7 +62,20 @@ def from_folder(folder: Path) -> Subject:
     if len(scene) < 3:
         raise KroncError(f"{folder}: {len(scene)} views of keypoints.json are in reference.json, expected at least 3")
     truth = torch.stack([reference[name] for name in scene.names])
-    return Subject(folder.resolve().name, replace(scene, given_c2w=None), truth, folder)
+    return _in_metres(Subject(folder.resolve().name, replace(scene, given_c2w=None), truth, folder))
+
+
+def _in_metres(subject: Subject) -> Subject:
+    """A reference in which the car has no car's size, such as a COLMAP model, scaled by what cars measure."""
+    template, points = car_template(subject.scene.schema), subject.points
+    if template is None or int(points.isfinite().all(-1).sum()) < 3:
+        return subject
+    scale = template_frame(points, template).scale
+    if 1 / _UNLIKE_A_CAR < scale < _UNLIKE_A_CAR:
+        return subject
+    truth = subject.truth.clone()
+    truth[..., 3] *= scale
+    return replace(subject, truth=truth)
 
 
 def with_noise(subject: Subject, noise_px: float, seed: int) -> Subject:

@@ -40,6 +40,11 @@ class TableOptions:
 
     def subjects(self) -> list[Subject]:
         """Captures, or cars."""
+        if self.first_seed < 0:
+            raise KroncError(f"--first-seed is {self.first_seed}: expected 0 or more")
+        for noise in self.noise_px:
+            if not 0 <= noise < math.inf:
+                raise KroncError(f"--noise-px holds {noise}: expected finite standard deviations, 0 or more")
         if self.captures:
             return [from_folder(folder) for folder in self.captures]
         if self.cars < 1:
