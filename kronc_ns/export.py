@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import flip_camera_axes, invert
 from kronc_ns.keypoints.io import read_json, write_keypoints
 from kronc_ns.provenance import provenance
-from kronc_ns.scene import Scene, camera_and_frames, read_poses
+from kronc_ns.scene import Scene, camera_and_frames, check_file_names, read_poses
 from kronc_ns.solve.solution import Solution
 
 MARKER = ".kronc-incomplete"
@@ -41,28 +41,42 @@ def is_report(file: Path) -> bool:
         return _REPORT_MARK in start.read(1000)
 
 
-def claim_output(folder: Path) -> None:
-    """Make ``folder`` ours to write: new, empty, or holding an earlier (also an interrupted) result of kronc.
+Kind = Literal["solution", "data set", "capture"]
+"""What an output folder holds: poses alone; poses with the frames and detections they came from; a scene to solve."""
+
+
+def claim_output(folder: Path, kind: Kind = "solution") -> None:
+    """Make ``folder`` ours to write: new, empty, or holding an earlier (also an interrupted) result of this ``kind``.
 
     Raises `KroncError` where it holds anything else.
     """
     if folder.exists() and not folder.is_dir():
         raise KroncError(f"{folder} is a file: expected a folder for the output")
-    if (
-        folder.is_dir()
-        and any(folder.iterdir())
-        and not ((folder / "kronc.json").exists() or (folder / MARKER).exists())
-    ):
-        raise KroncError(f"{folder} already holds data that kronc did not write: choose a new or empty folder")
+    if folder.is_dir() and any(folder.iterdir()) and (held := _held(folder)) != kind:
+        what = "data that kronc did not write" if held is None else f"a {held}, which is not for a {kind} to replace"
+        raise KroncError(f"{folder} already holds {what}: choose a new or empty folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / MARKER).touch()
+        (folder / MARKER).write_text(kind)
         (folder / "kronc.json").unlink(missing_ok=True)
         report = folder / REPORT_FILE
         if report.is_file() and is_report(report):  # of the earlier result
             report.unlink()
     except OSError as error:
         raise KroncError(f"{folder} cannot be written: {error.strerror}") from None
+
+
+def _held(folder: Path) -> str | None:
+    """The kind of the result, whole or interrupted, that kronc left in a folder; None where it left none."""
+    if (folder / MARKER).exists():
+        return (folder / MARKER).read_text()
+    if not (folder / "kronc.json").exists():
+        return None
+    try:
+        record = read_json(folder / "kronc.json")
+    except KroncError:  # broken
+        return "solution"
+    return "data set" if isinstance(record, dict) and record.get("data") == "." else "solution"
 
 
 def release_output(folder: Path) -> None:
@@ -193,6 +207,7 @@ def write_colmap(folder: Path, solved: Path) -> int:
 
     transforms = solved / "transforms.json"
     camera, frames = camera_and_frames(read_json(transforms), transforms)
+    check_file_names([frame["file_path"] for frame in frames], transforms)
     poses = read_poses(transforms)
     points = _solved_points(solved)
     model = pycolmap.Reconstruction()

@@ -1,6 +1,7 @@
 """The scene: everything a solver may know about a capture, read from a scene folder and checked."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -20,6 +21,7 @@ from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.select import select_instances
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
+_UNDONE_PX, _FEW = 0.5, 0.05
 _DEPTH_UNIT_M = 1e-3  # nerfstudio's depth maps are 16-bit millimetres
 
 
@@ -89,6 +91,7 @@ def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
     if is_solution:
         found = _without(found, left_out_views(folder))
     rows, note = match_keypoints(found, names, camera, [folder / m for m in masks] if all(masks) and masks else None)
+    _check_distortion(camera, torch.from_numpy(rows), file)
     return Scene(
         names=names,
         camera=camera,
@@ -123,16 +126,27 @@ def camera_and_frames(content: Any, file: Path) -> tuple[Camera, list[dict[str, 
         if missing:
             raise KroncError(f"{file}: {', '.join(missing)} missing: expected the intrinsics at the top level")
         try:
-            numbers = [float(merged[key] or 0.0) for key in _INTRINSICS]
-        except (TypeError, ValueError):
-            raise KroncError(f"{file}: intrinsics {merged} are not all numbers") from None
-        fx, fy, cx, cy, width, height, k1, k2, p1, p2 = numbers
-        cameras.add(Camera(fx, fy, cx, cy, int(width), int(height), k1, k2, p1, p2))
+            numbers = [float(0.0 if merged[key] is None else merged[key]) for key in _INTRINSICS]
+            width, height = map(int, numbers[4:6])
+        except (TypeError, ValueError, OverflowError):
+            raise KroncError(f"{file}: intrinsics {merged} are not all finite numbers") from None
+        fx, fy, cx, cy = numbers[:4]
+        cameras.add(Camera(fx, fy, cx, cy, width, height, *numbers[6:]))
     if len(cameras) > 1:
         sizes = sorted({(c.width, c.height) for c in cameras})
         what = f"images of different sizes {sizes}" if len(sizes) > 1 else "frames with different intrinsics"
         raise KroncError(f"{file}: {what}: expected one camera and one size for all views")
     return cameras.pop(), frames
+
+
+def check_file_names(names: Sequence[str], file: Path) -> None:
+    """Raise `KroncError` where folders alone tell images apart, for what knows them by file name."""
+    (name, count), *_ = Counter(PurePosixPath(name).name for name in names).most_common(1)
+    if count > 1:
+        raise KroncError(
+            f"{file}: {count} images in different folders are called {name}: here views are told apart by file name, "
+            "give each its own"
+        )
 
 
 def match_keypoints(
@@ -197,6 +211,21 @@ def read_poses(file: Path) -> dict[str, Float[Tensor, "3 4"]]:
     return {str(frame["file_path"]): _pose(frame, file) for frame in posed}
 
 
+def _check_distortion(camera: Camera, keypoints: Float[Tensor, "n j 3"], file: Path) -> None:
+    """Distortion can be undone where keypoints are, but for a few in the corners."""
+    uv = keypoints[..., :2]
+    inside = (keypoints[..., 2] > 0) & (uv >= 0).all(-1) & (uv[..., 0] <= camera.width) & (uv[..., 1] <= camera.height)
+    if not any(camera.distortion) or not inside.any():
+        return
+    off = (camera.distort(camera.undistort(uv[inside])) - uv[inside]).norm(dim=-1)
+    lost = float((~(off < _UNDONE_PX)).double().mean())
+    if lost > _FEW:
+        raise KroncError(
+            f"{file}: distortion (k1, k2, p1, p2) = {camera.distortion} cannot be undone for {100 * lost:.0f} % of the "
+            "keypoints: expected OpenCV's coefficients of this camera, or none"
+        )
+
+
 def _check_images(folder: Path, names: tuple[str, ...]) -> None:
     """Every listed image exists, unless the scene has keypoints only (no image folder at all)."""
     if not any((folder / name).parent.is_dir() and any((folder / name).parent.iterdir()) for name in names[:1]):
@@ -232,10 +261,10 @@ def _given_depths(
     folder: Path, frames: list[dict[str, Any]], rows: Float[np.ndarray, "n j 3"], camera: Camera
 ) -> Float[Tensor, "n j"] | None:
     """Depth maps (nerfstudio's 16-bit millimetres, or .npy in metres) read under the keypoints."""
-    if not all("depth_file_path" in frame for frame in frames):
+    if not all(frame.get("depth_file_path") for frame in frames):
         return None
     depths = [
-        depth_under(row, read_depth(folder / frame["depth_file_path"]), camera)
+        depth_under(row, read_depth(folder / str(frame["depth_file_path"])), camera)
         for frame, row in zip(frames, rows, strict=True)
     ]
     return torch.from_numpy(np.stack(depths))

@@ -184,6 +184,19 @@ def test_a_finished_result_is_taken_back_before_it_is_written_over(solved):
     assert not (solved / "kronc.json").exists()
 
 
+def test_results_of_another_kind_are_not_replaced(solved, tmp_path):
+    """Rendering a capture, or solving another, must not take a data set with its detections."""
+    before = listing(solved)
+    with pytest.raises(KroncError, match="holds a solution, which is not for a capture to replace"):
+        claim_output(solved, "capture")
+    assert listing(solved) == before
+    claim_output(tmp_path / "data", "data set")
+    for other in ("solution", "capture"):
+        with pytest.raises(KroncError, match="holds a data set"):
+            claim_output(tmp_path / "data", other)
+    claim_output(tmp_path / "data", "data set")
+
+
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(KroncError, match="out cannot be written"):
@@ -230,6 +243,12 @@ def model(solved, tmp_path):
 
     assert write_colmap(tmp_path / "colmap", solved) == 15
     return pycolmap.Reconstruction(str(tmp_path / "colmap"))
+
+
+def test_a_colmap_model_needs_file_names_of_their_own(solved, edit, tmp_path):
+    edit(solved / "transforms.json", lambda c: [f.update(file_path=f"{i}/a.png") for i, f in enumerate(c["frames"])])
+    with pytest.raises(KroncError, match="15 images in different folders are called a.png"):
+        write_colmap(tmp_path / "colmap", solved)
 
 
 def test_colmap_camera_images_and_poses(model, solution):

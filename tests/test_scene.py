@@ -1,4 +1,5 @@
 import json
+import math
 
 import cv2
 import numpy as np
@@ -73,6 +74,14 @@ def frames(change):
         ("transforms.json", lambda c: c.pop("fl_x"), "fl_x missing"),
         ("transforms.json", lambda c: c.update(fl_x=0.0, fl_y=0.0), "not positive"),
         ("transforms.json", lambda c: c.update(cx=None), "cx missing"),
+        ("transforms.json", lambda c: c.update(cx=[]), "not all finite numbers"),
+        ("transforms.json", lambda c: c.update(w=math.inf), "not all finite numbers"),
+        ("transforms.json", lambda c: c.update(cx=-5), "principal point"),
+        ("transforms.json", lambda c: c.update(k1=1e9), "cannot be undone for"),
+        ("keypoints.json", lambda c: c.update(width="abc"), "width and height are 'abc'"),
+        ("keypoints.json", lambda c: c.update(frames=None), "expected .frames."),
+        ("keypoints.json", lambda c: c.update(schema={"name": "x", "keypoints": 5}), "a list of names"),
+        ("keypoints.json", lambda c: c["frames"][0]["keypoints"][0].__setitem__(2, 100.0), "confidence is 100"),
         ("transforms.json", lambda c: c.update(frames=[]), "no frames"),
         ("transforms.json", lambda c: c.update(frames="x"), "expected .frames."),
         ("transforms.json", lambda c: c.update(camera_model="OPENCV_FISHEYE"), "not supported"),

@@ -67,7 +67,7 @@ def import_dataset(data: Path, output: Path, splits: Sequence[str] = ("train", "
         views = _joined([_carpatch_split(data, split) for split in splits])
     else:
         views = _posed_by_colmap(data)
-    claim_output(output)
+    claim_output(output, "capture")
     _write(output, views)
     release_output(output)
     return len(views.images)

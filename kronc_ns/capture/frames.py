@@ -110,6 +110,8 @@ def prepare_frames(
     its transforms.json speaks of those pixels. Frames of an earlier run are removed first, but nothing in ``keep``.
     """
     signature = _signature(source, sampling or Sampling(), num_downscales)
+    if (out / RECORD).exists() and source.reference is None:
+        (out / "reference.json").unlink(missing_ok=True)  # of the frames that go now
     (out / RECORD).unlink(missing_ok=True)
     _clear(out, keep)
     (out / "images").mkdir(exist_ok=True)

@@ -1,5 +1,6 @@
 """Single image files: read with a helpful error, copied upright, downscaled."""
 
+import math
 import shutil
 import struct
 import zlib
@@ -78,8 +79,8 @@ def copy_upright(source: Path, target: Path, orient: bool = True) -> Image.Image
 
 def downscale_factors(size: tuple[int, int], num_downscales: int) -> tuple[int, ...]:
     """2, 4, 8, ... as far as the smaller side keeps about 100 px."""
-    factors = (2**level for level in range(1, num_downscales + 1))
-    return tuple(factor for factor in factors if min(size) // factor >= _SMALLEST_SIDE)
+    levels = min(num_downscales, int(math.log2(max(1.0, min(size) / _SMALLEST_SIDE))))
+    return tuple(2**level for level in range(1, levels + 1))
 
 
 def downscale(image: Image.Image, factor: int) -> Image.Image:

@@ -22,6 +22,7 @@ def find_masks(masks: Path | tuple[Path, ...], frames: Frames) -> tuple[Path, ..
         raise KroncError(f"{masks} is no folder: expected one mask image per photo, of the same stem")
     files = {file.stem: file for file in sorted(masks.iterdir()) if file.suffix.lower() in IMAGE_SUFFIXES}
     wanted = [[_stem(name) for name in names] for names in (frames.source_names, frames.names)]
+    wanted = [stems for stems in wanted if len({*stems}) == len(stems)]  # a mask is for one image
     for stems in wanted:
         if all(stem in files for stem in stems):
             return tuple(files[stem] for stem in stems)

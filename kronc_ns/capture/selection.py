@@ -31,7 +31,7 @@ class Sampling:
         if self.num_frames < MIN_FRAMES:
             raise KroncError(f"--num-frames is {self.num_frames}: expected at least {MIN_FRAMES}")
         if self.fps is not None and not 0 < self.fps < float("inf"):
-            raise KroncError(f"--fps is {self.fps:g}: expected a number above 0")
+            raise KroncError(f"--fps is {self.fps:g}: expected a finite number above 0")
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,11 @@ class Camera:
             )
         if self.width <= 0 or self.height <= 0:
             raise KroncError(f"image size {self.width}x{self.height} is not positive: expected w and h in pixels")
+        if not (0 < self.cx < self.width and 0 < self.cy < self.height):
+            raise KroncError(
+                f"principal point ({self.cx:g}, {self.cy:g}) is not in the image of {self.width}x{self.height}: "
+                "expected cx and cy in pixels, near its centre"
+            )
 
     @property
     def distortion(self) -> tuple[float, float, float, float]:

@@ -34,9 +34,17 @@ class Detections:
 
 def read_keypoints(path: Path) -> Detections:
     """Read a keypoint file or folder in any of the three formats."""
+    found = _read(path)
+    for name, instances in found.frames.items():
+        if instances.size and (most := instances[..., 2].max()) > 1:
+            raise KroncError(f"{found.source}, {name}: a confidence is {most:g}: expected 0 (not seen) to 1")
+    return found
+
+
+def _read(path: Path) -> Detections:
     if path.is_dir():
         own = path / "keypoints.json"
-        return read_keypoints(own) if own.exists() else _read_openpifpaf(path)
+        return _read(own) if own.exists() else _read_openpifpaf(path)
     if not path.exists():
         raise KroncError(f"{path} does not exist: expected {FORMATS}")
     content = read_json(path)
@@ -66,10 +74,10 @@ def write_keypoints(
 def read_json(path: Path) -> Any:
     """Parsed JSON, or an error that names the file and the place in it."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise KroncError(f"{path} does not exist") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise KroncError(f"{path} is not valid JSON ({error}): restore the file or write it anew") from None
     except OSError as error:
         raise KroncError(f"{path} cannot be read: {error.strerror}") from None
@@ -110,6 +118,8 @@ def read_schema(described: Any, path: Path) -> KeypointSchema:
             f"{path}: schema {described!r} is unknown: expected {known} or "
             '{"name": ..., "keypoints": [...], "flip": [[i, j], ...]}'
         )
+    if not isinstance(described["keypoints"], list):
+        raise KroncError(f"{path}: schema keypoints {described['keypoints']!r}: expected a list of names")
     flip = list(range(len(described["keypoints"])))
     try:
         for i, j in described.get("flip", []):
@@ -121,7 +131,13 @@ def read_schema(described: Any, path: Path) -> KeypointSchema:
 
 def _read_own(path: Path, content: dict[str, Any]) -> Detections:
     schema = read_schema(content.get("schema"), path)
-    size = (int(content["width"]), int(content["height"])) if {"width", "height"} <= content.keys() else None
+    try:
+        size = (int(content["width"]), int(content["height"])) if {"width", "height"} <= content.keys() else None
+    except (TypeError, ValueError, OverflowError):
+        size_given = f"{content['width']!r} x {content['height']!r}"
+        raise KroncError(f"{path}: width and height are {size_given}: expected pixels") from None
+    if not isinstance(content["frames"], list):
+        raise KroncError(f'{path}: expected "frames", a list of objects with "file_path" and "keypoints"')
     frames: dict[str, np.ndarray] = {}
     for number, frame in enumerate(content["frames"]):
         if not isinstance(frame, dict) or not {"file_path", "keypoints"} <= frame.keys():
@@ -185,10 +201,10 @@ def _read_coco(path: Path, content: dict[str, Any]) -> Detections:
         sizes = {(int(i["width"]), int(i["height"])) for i in images.values() if {"width", "height"} <= i.keys()}
     except (KeyError, TypeError) as error:
         raise KroncError(f"{path}: COCO field {error} is missing or of the wrong kind") from None
-    labels = np.concatenate([np.ravel(values).astype(np.float64)[2::3] for _, values in rows] or [np.zeros(0)])
+    checked = [_rows(values, schema, f"{path}, {name}") for name, values in rows]
+    labels = np.concatenate([uvc[:, 2] for uvc in checked] or [np.zeros(0)])
     full_score = 2.0 if labels.size and np.isin(labels, (0.0, 1.0, 2.0)).all() and (labels == 2.0).any() else 1.0
-    for name, values in rows:
-        uvc = _rows(values, schema, f"{path}, {name}")
+    for (name, _), uvc in zip(rows, checked, strict=True):
         uvc[:, 2] /= full_score
         instances[name].append(uvc)
     if len(sizes) > 1:

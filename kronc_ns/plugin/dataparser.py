@@ -30,7 +30,7 @@ from kronc_ns.plugin.checks import check_masks, check_not_negative, check_positi
 from kronc_ns.plugin.images import cut_out, downscaled
 from kronc_ns.plugin.seeds import Seeds, box_seeds, grey, ground_seeds
 from kronc_ns.plugin.visual_hull import carve, read_pictures
-from kronc_ns.scene import Scene, camera_and_frames, load_scene, read_poses
+from kronc_ns.scene import Scene, camera_and_frames, check_file_names, load_scene, read_poses
 from kronc_ns.solve.solution import Status
 
 _BOX_MARGIN = 0.1  # of the car's length: keypoints stop short of tyres, mirrors and the roof
@@ -90,6 +90,7 @@ class KroncDataParser(DataParser):
         """The scene, poses (OpenCV c2w) by file name of the views that have one, and the report of the solution."""
         config = self.config
         scene = load_scene(config.data, config.keypoints)
+        check_file_names(scene.names, config.data / "transforms.json")
         report = read_report(config.data)
         if report is not None and config.keypoints is None and not config.any_solver_option():
             folder = config.data

@@ -97,7 +97,7 @@ class KroncToNerfstudio:
                 f"the frames in {out / 'images'} are not of this command, so the keypoints beside them do not fit: "
                 "repeat the options of the first run, or run without --keypoints and detect anew"
             )
-        claim_output(out)
+        claim_output(out, "data set")
         if frames is None:
             with progress_bar("frames") as progress:
                 keep = [self.masks] if self.masks else []

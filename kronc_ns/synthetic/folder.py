@@ -42,7 +42,7 @@ def write_capture(
     """
     if render:
         _check_renderer(capture, renderer)
-    claim_output(folder)
+    claim_output(folder, "capture")
     names = [f"images/frame_{i + 1:05d}.png" for i in range(len(capture.c2w))]
     masks = [name.replace("images", "masks") for name in names] if render else None
     depths = [name.replace("images", "depths") for name in names] if render else None

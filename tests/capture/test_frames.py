@@ -264,3 +264,17 @@ def test_the_reference_gets_the_new_names(tmp_path: Path):
     copied = json.loads((tmp_path / "out" / "reference.json").read_text())
     expected = [{"file_path": f"images/frame_0000{i}.png", "transform_matrix": matrix} for i in (1, 2)]
     assert copied == {"w": 64, "frames": expected}
+
+
+def test_the_reference_of_other_frames_goes_with_them(tmp_path: Path):
+    """Another capture into the same folder, without poses to compare with; somebody's own file stays."""
+    out = tmp_path / "out"
+    for scene in ("first", "second"):
+        for i in range(3):
+            _photo(tmp_path / scene / "images" / f"IMG_{i}.png", seed=10 * len(scene) + i)
+    out.mkdir()
+    (out / "reference.json").write_text("mine")
+    _prepare(tmp_path / "first", out)
+    assert (out / "reference.json").exists()
+    _prepare(tmp_path / "second", out)
+    assert not (out / "reference.json").exists()

@@ -421,6 +421,13 @@ def test_options_that_cannot_be_are_named(refused, tmp_path):
     refused("'nothing'", "phone_walk", config="nothing")
 
 
+def test_images_that_only_folders_tell_apart_are_refused(refused, changed, edit):
+    shutil.copytree(changed / "images", changed / "others")
+    for file in ("transforms.json", "keypoints.json"):
+        edit(changed / file, lambda c: c["frames"][1].update(file_path="others/frame_00001.png"))
+    refused("2 images in different folders are called frame_00001.png", data=changed)
+
+
 def test_missing_images_are_named(refused, changed):
     shutil.rmtree(changed / "images")
     refused("images/frame_00002.png", "does not exist", data=changed)

@@ -283,7 +283,7 @@ def test_a_doubtful_solution_is_written_and_ends_with_3(
     ("change", "message"),
     [
         ({"data": Path("nowhere")}, "nowhere does not exist: expected a scene folder"),
-        ({"fps": 0.0}, "--fps is 0: expected a number above 0"),
+        ({"fps": 0.0}, "--fps is 0: expected a finite number above 0"),
         ({"num_frames": 2}, "--num-frames is 2: expected at least 3"),
         ({"num_downscales": -1}, "--num-downscales is -1"),
         ({"masks": Path("nowhere")}, "--masks nowhere is no folder"),
