@@ -88,7 +88,7 @@ def _solve_some(
     for folder in folders:
         try:
             scenes[folder] = with_depths(load_scene(folder), folder, config, depth_weights)
-        except KroncError as error:
+        except (KroncError, OSError) as error:
             outcomes[folder] = Outcome(folder, "error", str(error))
     solutions = solve_scenes(list(scenes.values()), config)
     for (folder, scene), solution in zip(scenes.items(), solutions, strict=True):

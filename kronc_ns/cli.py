@@ -170,7 +170,9 @@ class Synth:
         }
         for name, noise in noises.items():
             if not 0 <= noise < math.inf:
-                raise KroncError(f"{name} is {noise}: expected a standard deviation, 0 or more")
+                raise KroncError(f"{name} is {noise}: expected a finite standard deviation, 0 or more")
+        if not 0 <= self.seed < 2**63:
+            raise KroncError(f"--seed is {self.seed}: expected 0 to 2**63 - 1")
         if self.views < 1 or (self.width is not None and self.width < 16):
             raise KroncError(
                 f"--views {self.views} --width {self.width}: expected at least 1 view of at least 16 pixels"

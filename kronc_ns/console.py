@@ -38,6 +38,8 @@ def exit_on_error() -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT):
             sys.exit(_fail(f"{error.filename or 'output'} cannot be written: {error.strerror}", 2))
+        if error.errno == errno.ENAMETOOLONG:
+            sys.exit(_fail(f"{error.filename}: {error.strerror}: expected a shorter path", 2))
         raise
     finally:
         if in_main_thread:

@@ -52,7 +52,6 @@ class KroncConfig:
         positive = {
             "radius_m": self.radius_m,
             "laps": self.laps,
-            "car_length_m": 1.0 if self.car_length_m is None else self.car_length_m,
             "adam.steps": self.adam.steps,
             "adam.learning_rate": self.adam.learning_rate,
             "lm.iterations": self.lm.iterations,
@@ -61,6 +60,8 @@ class KroncConfig:
         for name, value in positive.items():
             if not 0 < value < math.inf:
                 raise KroncError(f"{name} is {value}: expected a finite number above 0")
+        if self.car_length_m is not None and not 0.01 <= self.car_length_m <= 100:
+            raise KroncError(f"car_length_m is {self.car_length_m:g}: expected metres, from 0.01 to 100")
         weights = self.adam.weight_2d, self.adam.weight_3d
         if not all(0 <= weight < math.inf for weight in weights) or sum(weights) <= 0:
             raise KroncError(

@@ -25,6 +25,7 @@ from kronc_ns.frame import standing, template_frame
 from kronc_ns.geometry.alignment import Similarity, umeyama
 from kronc_ns.geometry.camera import rays
 from kronc_ns.init import circular_poses, prior_depths, random_depths
+from kronc_ns.keypoints.io import describe_schema
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.options import KroncConfig as KroncConfig
 from kronc_ns.repair import repair
@@ -35,7 +36,7 @@ from kronc_ns.solve.threads import one_thread, turn
 from kronc_ns.starts import Start, circles, start_from_poses, start_from_template, usable_views
 from kronc_ns.verify import Evidence, verify
 
-_FORMAT = 4  # raised whenever the same input and options give another solution
+_FORMAT = 5  # raised whenever the same input and options give another solution
 _TOGETHER = 4  # scenes that go through the stages together
 _CONTRADICTED = 0.5  # of the mean distance from their middle: given centres that are off by more are no use
 _PROMISING = 2  # of the circles, those whose odd views are located anew
@@ -76,7 +77,7 @@ def solve_scenes(
         with turn(lock):
             return _solve_some(group, config, None)
 
-    with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
         for solutions in pool.map(solve, groups):
             outcome += solutions
             if progress is not None:
@@ -111,7 +112,7 @@ def fingerprint(scene: Scene, config: KroncConfig) -> str:
     given = scene.given_c2w if config.init in ("auto", "given") else None
     depths = scene.given_depths if config.depth_init != "random" else None
     names = [PurePosixPath(name).name for name in scene.names]
-    header = json.dumps([_FORMAT, names, asdict(scene.camera), scene.schema.name, settings], sort_keys=True)
+    header = json.dumps([_FORMAT, names, asdict(scene.camera), describe_schema(scene.schema), settings], sort_keys=True)
     digest = hashlib.sha256(header.encode())
     for array in (scene.keypoints, given, depths):
         digest.update(b"-" if array is None else array.double().numpy().tobytes())

@@ -147,7 +147,7 @@ def _judge(
     if not evidence.converged:
         problems.append(f"the solver was still moving after {solution.iterations} steps: allow more")
     if count < MIN_VIEWS:
-        problems.append(f"only {count} views: nothing but the car template holds them together")
+        problems.append(f"only {count} view{'s' * (count > 1)}: nothing but the car template holds them together")
     elif not _redundant(kept):
         problems.append("the views share so few keypoints that any poses would meet them: take more views")
     if share > POOR_FIT / 2:

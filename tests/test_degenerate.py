@@ -14,6 +14,7 @@ from kronc_ns.geometry.poses import invert, make_pose, transform
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
 from kronc_ns.pipeline import KroncConfig, solve_scene
+from kronc_ns.report import write_report
 from kronc_ns.scene import Scene
 from kronc_ns.solve.adam import AdamConfig
 from kronc_ns.solve.lm import LmConfig
@@ -144,6 +145,8 @@ def test_trouble_from_one_start_ends_in_a_status(trouble, schema, init, tmp_path
 def test_trouble_from_every_start_ends_in_a_status(trouble, schema, tmp_path):
     scene = scene_with(trouble, schema)
     assert_says_what_it_is(solve_scene(scene), trouble, scene, tmp_path / "out")
+    if trouble in FAILED - {"no keypoints"}:  # no such scene can be read
+        assert "failed" in write_report(tmp_path / "out").read_text()
 
 
 @pytest.mark.parametrize("trouble", KEYPOINTS)

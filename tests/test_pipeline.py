@@ -236,6 +236,8 @@ def test_fingerprint_knows_contents_and_options_but_no_paths(noisy):
     assert fingerprint(noisy, QUICK) == fingerprint(same, QUICK)
     assert fingerprint(noisy, QUICK) == fingerprint(noisy, replace(QUICK, device="cpu"))
     assert fingerprint(noisy, QUICK) != fingerprint(noisy, replace(QUICK, seed=1))
+    renamed = replace(APOLLOCAR3D_66, keypoints=APOLLOCAR3D_66.keypoints[::-1])  # another order under the same name
+    assert fingerprint(noisy, QUICK) != fingerprint(replace(noisy, schema=renamed), QUICK)
     keypoints = noisy.keypoints.clone()
     keypoints[0, 0, 0] += 1e-6
     assert fingerprint(noisy, QUICK) != fingerprint(replace(noisy, keypoints=keypoints), QUICK)

@@ -169,10 +169,12 @@ def _layout(height: int = 360) -> dict:
 
 
 def _axis(values: Sequence[float]) -> dict:
-    """A logarithmic axis, unless a factor of two spans all values.
+    """A logarithmic axis, unless a factor of two spans all values or one is 0.
 
     Its marks are whole numbers, for plotly writes a mere 2 for 0.2 and for 20.
     """
+    if min(values) <= 0:
+        return {}
     low, high = math.log10(min(values)), math.log10(max(values))
     if high - low < math.log10(2):
         return {}
