@@ -206,3 +206,14 @@ def test_table_options_come_from_the_command_line(tmp_path):
     assert options == TableOptions(output_dir=tmp_path, noise_px=(0.5, 2.0))
     with pytest.raises(KroncError, match="--cars 0"):
         replace(options, cars=0).subjects()
+
+
+@pytest.mark.slow
+def test_rows_measured_before_an_error_are_kept(tmp_path):
+    def rows(_):
+        return [Setting({"method": name}, name, 0.0) for name in ("kronc", "colmap-global")]
+
+    with pytest.raises(KroncError, match="--captures"):
+        make_table("begun", "A table that ends early", TableOptions(output_dir=tmp_path, cars=1), rows)
+    (row,) = json.loads((tmp_path / "begun.json").read_text())["rows"]
+    assert row["labels"] == {"method": "kronc"}

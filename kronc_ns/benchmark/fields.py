@@ -4,6 +4,7 @@ import json
 import math
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -54,18 +55,23 @@ class FieldOptions:
 
 
 def make_field_table(options: FieldOptions) -> None:
-    """Train and test on all of them; print the table and write it."""
+    """Train and test on all of them; print the table, which is written after every row."""
     if options.output_dir.exists() and any(options.output_dir.iterdir()):
         raise KroncError(f"{options.output_dir} is in use: expected a new or empty folder")
-    begin, machine = time.perf_counter(), hardware()
-    rows = []
+    begin, machine, text = time.perf_counter(), hardware(), ""
+    rows: list[dict[str, Any]] = []
     with Commands({"KRONC_NS_CACHE": str(options.output_dir.resolve() / "cache")}) as commands:
         for folder in options.captures:
             subject = from_folder(folder)
             for poses in options.poses:
                 rows.append(_row(subject, poses, options, commands))
                 print(" | ".join(rows[-1]["cells"]), file=sys.stderr)
-    seconds = time.perf_counter() - begin
+                text = _write(rows, options, machine, time.perf_counter() - begin)
+    Console(soft_wrap=True).print(text, markup=False, highlight=False)
+
+
+def _write(rows: Sequence[Mapping[str, Any]], options: FieldOptions, machine: Mapping[str, Any], seconds: float) -> str:
+    """Write what there is of the table; its Markdown."""
     head = ["capture", "poses", "views placed", "rotation, centre (median)", *options.backgrounds, "paper"]
     lines = [head, ["---"] * len(head), *([*row["cells"], _PAPER.get(row["poses"], "-")] for row in rows)]
     text = (
@@ -79,7 +85,7 @@ def make_field_table(options: FieldOptions) -> None:
     with atomic_path(options.output_dir / "fields.md") as path:
         path.write_text(text, encoding="utf-8")
     write_json(options.output_dir / "fields.json", plain({"hardware": machine, "seconds": seconds, "rows": rows}))
-    Console(soft_wrap=True).print(text, markup=False, highlight=False)
+    return text
 
 
 def _row(subject: Subject, poses: PosesOf, options: FieldOptions, commands: Commands) -> dict[str, Any]:

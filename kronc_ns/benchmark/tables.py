@@ -75,8 +75,8 @@ class Setting:
 def make_table(
     name: str, title: str, options: TableOptions, settings: Callable[[TableOptions], Sequence[Setting]]
 ) -> None:
-    """Measure all settings on all subjects; print the table and write it."""
-    begin = time.perf_counter()
+    """Measure all settings on all subjects; print the table, which is written after every row."""
+    begin, text = time.perf_counter(), ""
     machine, subjects = hardware(), options.subjects()
     chosen = [row for row in settings(options) if row.method in (options.methods or (row.method,))]
     if not chosen:
@@ -95,7 +95,20 @@ def make_table(
                     "runs": dict(zip(names, runs, strict=True)),
                 }
             )
-    seconds = time.perf_counter() - begin
+            text = _write(name, title, options, subjects, machine, rows, time.perf_counter() - begin)
+    Console(soft_wrap=True).print(text, markup=False, highlight=False)
+
+
+def _write(
+    name: str,
+    title: str,
+    options: TableOptions,
+    subjects: Sequence[Subject],
+    machine: Mapping[str, Any],
+    rows: Sequence[Mapping[str, Any]],
+    seconds: float,
+) -> str:
+    """Write what there is of a table; its Markdown."""
     about = (
         f"{len(subjects)} captures ({', '.join(subject.name for subject in subjects)}), seeds from "
         f"{options.first_seed} on; {machine['cores']} cores ({machine['cpu']}), load {machine['load_1min'] or 0:.1f}, "
@@ -107,7 +120,7 @@ def make_table(
         path.write_text(text, encoding="utf-8")
     content = {"table": name, "title": title, "hardware": machine, "seconds": seconds, "rows": rows}
     write_json(options.output_dir / f"{name}.json", plain(content))
-    Console(soft_wrap=True).print(text, markup=False, highlight=False)
+    return text
 
 
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
