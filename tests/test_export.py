@@ -247,7 +247,7 @@ def model(solved, tmp_path):
 
 def test_a_colmap_model_needs_file_names_of_their_own(solved, edit, tmp_path):
     edit(solved / "transforms.json", lambda c: [f.update(file_path=f"{i}/a.png") for i, f in enumerate(c["frames"])])
-    with pytest.raises(KroncError, match="15 images in different folders are called a.png"):
+    with pytest.raises(KroncError, match=r"15 images in different folders are called a\.png"):
         write_colmap(tmp_path / "colmap", solved)
 
 
