@@ -52,7 +52,7 @@ def claim_output(folder: Path, kind: Kind = "solution") -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise KroncError(f"{folder} is a file: expected a folder for the output")
-    if folder.is_dir() and any(folder.iterdir()) and (held := _held(folder)) != kind:
+    if folder.is_dir() and any(folder.iterdir()) and (held := _held(folder)) not in (kind, ""):
         what = "data that kronc did not write" if held is None else f"a {held}, which is not for a {kind} to replace"
         raise KroncError(f"{folder} already holds {what}: choose a new or empty folder")
     try:
@@ -67,7 +67,10 @@ def claim_output(folder: Path, kind: Kind = "solution") -> None:
 
 
 def _held(folder: Path) -> str | None:
-    """The kind of the result, whole or interrupted, that kronc left in a folder; None where it left none."""
+    """The kind of the result, whole or interrupted, that kronc left in a folder; None where it left none.
+
+    Empty where a version interrupted there did not say.
+    """
     if (folder / MARKER).exists():
         return (folder / MARKER).read_text()
     if not (folder / "kronc.json").exists():

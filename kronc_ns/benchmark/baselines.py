@@ -99,7 +99,7 @@ def _model(scene: Scene, c2w: Tensor, points: Tensor, used: Tensor) -> Any:
 
     camera = scene.camera
     model = pycolmap.Reconstruction()
-    kind, focal = "SIMPLE_PINHOLE", [camera.fx]
+    kind, focal = "SIMPLE_PINHOLE", [camera.fx]  # refined as one
     if camera.fx != camera.fy:
         kind, focal = "PINHOLE", [camera.fx, camera.fy]
     intrinsics = [*focal, camera.cx, camera.cy]

@@ -139,11 +139,11 @@ def prepare_frames(
 
 
 def frame_names(images: Sequence[Path]) -> tuple[str, ...]:
-    """New paths: files that are all called frame_NNNNN keep their names, others are counted from 1.
+    """New paths, of different stems: files that are all called frame_NNNNN keep their names, else are counted from 1.
 
     HEIF becomes JPEG, which trainers read.
     """
-    if all(_OURS.fullmatch(image.name) for image in images) and len({image.name for image in images}) == len(images):
+    if all(_OURS.fullmatch(image.name) for image in images) and len({image.stem for image in images}) == len(images):
         return tuple(f"images/{image.name}" for image in images)
     suffixes = (".jpg" if image.suffix.lower() in HEIF_SUFFIXES else image.suffix.lower() for image in images)
     return tuple(f"images/frame_{number:05d}{suffix}" for number, suffix in enumerate(suffixes, start=1))

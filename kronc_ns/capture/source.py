@@ -15,7 +15,7 @@ from kronc_ns.capture.images import HEIF_SUFFIXES, read_heif
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.io import read_json
-from kronc_ns.scene import camera_and_frames, check_file_names, read_poses
+from kronc_ns.scene import camera_and_frames, read_poses
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 """Image files that are taken, in lower case."""
@@ -109,7 +109,6 @@ def _scene(data: Path) -> Source:
     file = data / "transforms.json"
     camera, frames = camera_and_frames(read_json(file), file)
     names = tuple(str(frame["file_path"]) for frame in frames)
-    check_file_names(names, file)
     images = tuple(data / name for name in names)
     missing = [image for image in images if not image.is_file()]
     if missing:

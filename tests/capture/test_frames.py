@@ -278,3 +278,26 @@ def test_the_reference_of_other_frames_goes_with_them(tmp_path: Path):
     assert (out / "reference.json").exists()
     _prepare(tmp_path / "second", out)
     assert not (out / "reference.json").exists()
+
+
+def test_a_mask_is_never_of_two_images(tmp_path: Path):
+    """Equal stems in two folders: masks by the old names are ambiguous, by the new ones they are not."""
+    for i in range(4):
+        _photo(tmp_path / "scene" / "ab"[i % 2] / f"frame_0000{i // 2}.png", seed=i)
+    names = [f"{'ab'[i % 2]}/frame_0000{i // 2}.png" for i in range(4)]
+    intrinsics = {"fl_x": 50.0, "fl_y": 50.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+    content = {**intrinsics, "frames": [{"file_path": name} for name in names]}
+    (tmp_path / "scene" / "transforms.json").write_text(json.dumps(content))
+    prepared = _prepare(tmp_path / "scene", tmp_path / "out")
+    assert [Path(name).stem for name in prepared.names] == [f"frame_0000{i}" for i in (1, 2, 3, 4)]
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for i in range(2):
+        Image.new("L", (64, 48), 255).save(masks / f"frame_0000{i}.png")
+    with pytest.raises(KroncError, match="lacks a mask for frame_00002"):
+        find_masks(masks, prepared)
+
+
+def test_photos_of_equal_stem_are_counted():
+    images = [Path("frame_00001.jpg"), Path("frame_00001.png"), Path("frame_00002.png")]
+    assert [Path(name).stem for name in frame_names(images)] == ["frame_00001", "frame_00002", "frame_00003"]
