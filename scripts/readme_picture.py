@@ -16,12 +16,13 @@ import torch
 import tyro
 from PIL import Image
 
+from kronc_ns.files.output import read_json
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.files.transforms import read_poses
+from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import umeyama
-from kronc_ns.init import circular_poses
-from kronc_ns.keypoints.io import read_json
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
-from kronc_ns.objective import reproject
-from kronc_ns.scene import load_scene, read_poses
+from kronc_ns.solve.objective import reproject
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#888888"  # told apart by colour-blind people
 

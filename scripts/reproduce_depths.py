@@ -5,7 +5,7 @@ import tyro
 
 from kronc_ns.benchmark.settings import by_depths
 from kronc_ns.benchmark.tables import TableOptions, make_table
-from kronc_ns.console import exit_on_error
+from kronc_ns.commands.console import exit_on_error
 
 if __name__ == "__main__":
     with exit_on_error():

@@ -4,7 +4,7 @@
 import tyro
 
 from kronc_ns.benchmark.fields import FieldOptions, make_field_table
-from kronc_ns.console import exit_on_error
+from kronc_ns.commands.console import exit_on_error
 
 if __name__ == "__main__":
     with exit_on_error():

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,70 +12,38 @@ import jaxtyping
 import numpy as np
 import pytest
 
-with jaxtyping.install_import_hook(
-    [
-        "kronc_ns.adjustment",
-        "kronc_ns.batch",
-        "kronc_ns.benchmark",
-        "kronc_ns.capture",
-        "kronc_ns.completion",
-        "kronc_ns.evaluate",
-        "kronc_ns.export",
-        "kronc_ns.frame",
-        "kronc_ns.geometry",
-        "kronc_ns.image_metrics",
-        "kronc_ns.init",
-        "kronc_ns.keypoints",
-        "kronc_ns.objective",
-        "kronc_ns.orbit",
-        "kronc_ns.pipeline",
-        "kronc_ns.repair",
-        "kronc_ns.report",
-        "kronc_ns.scene",
-        "kronc_ns.solve.adam",  # each by itself: solve.lm_cpu is compiled and cannot be checked
-        "kronc_ns.solve.bundle",
-        "kronc_ns.solve.lm",
-        "kronc_ns.solve.problem",
-        "kronc_ns.solve.resection",
-        "kronc_ns.solve.solution",
-        "kronc_ns.solve.uncertainty",
-        "kronc_ns.solved",
-        "kronc_ns.stages",
-        "kronc_ns.starts",
-        "kronc_ns.synthetic",
-        "kronc_ns.verify",
-        "kronc_ns.viewer",
-    ],
-    "beartype.beartype",
-):
-    import kronc_ns.completion
-    import kronc_ns.evaluate
-    import kronc_ns.image_metrics
-    import kronc_ns.init
-    import kronc_ns.keypoints.select
-    import kronc_ns.objective
-    import kronc_ns.repair
-    import kronc_ns.report
-    import kronc_ns.solve.adam
-    import kronc_ns.solved  # noqa: F401
+PACKAGE = Path(__file__).resolve().parents[1] / "kronc_ns"
 
-import torch
 
-from kronc_ns.export import claim_output, write_solution
-from kronc_ns.init import noisy_poses
-from kronc_ns.options import KroncConfig
-from kronc_ns.pipeline import solve_scene
-from kronc_ns.scene import Scene, load_scene
+def checked_modules() -> list[str]:
+    """Every module whose shapes are checked at run time: all but those with compiled functions, which cannot be."""
+    unchecked = ("@compiled", "import bpy", "# shapes unchecked")
+    files = [file for file in PACKAGE.rglob("*.py") if not any(mark in file.read_text() for mark in unchecked)]
+    return [".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts) for file in files if file.stem != "__init__"]
+
+
+# before any of them is imported
+_hook = jaxtyping.install_import_hook(checked_modules(), "beartype.beartype")
+
+from kronc_ns.files.output import claim_output
+from kronc_ns.files.record import write_solution
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.fit.pipeline import solve_scene
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66
+from kronc_ns.scene import Scene
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, make_capture
+from kronc_ns.synthetic.variations import noisy_poses
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @pytest.fixture(autouse=True)
 def seeded() -> None:
-    """torch's global generator starts alike in every test."""
-    torch.manual_seed(0)
+    """torch's global generator starts alike in every test that has it."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(0)
 
 
 @pytest.fixture(scope="session")
@@ -99,9 +68,9 @@ def lap() -> Capture:
 
 
 @pytest.fixture(scope="session")
-def lap_start(lap: Capture) -> torch.Tensor:
+def lap_start(lap: Capture) -> np.ndarray:
     """Its poses with (4 deg, 0.5 m) of noise."""
-    return noisy_poses(lap.c2w, 4.0, 0.5, torch.Generator().manual_seed(0))
+    return noisy_poses(lap.c2w, 4.0, 0.5, np.random.default_rng(0))
 
 
 @pytest.fixture
@@ -128,7 +97,7 @@ def edit():
 def solved_lap_folder(tmp_path_factory: pytest.TempPathFactory, lap: Capture) -> Path:
     """The lap of 20 views solved, the fifth of them without keypoints and every other with an image; for reading."""
     folder = tmp_path_factory.mktemp("lap")
-    keypoints = lap.keypoints.clone()
+    keypoints = lap.keypoints.copy()
     keypoints[4, :, 2] = 0
     write_capture(folder / "walk", replace(lap, keypoints=keypoints))
     scene = load_scene(folder / "walk")
@@ -167,9 +136,7 @@ def screenshots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def scene_of(capture: Capture, given: torch.Tensor | None = None) -> Scene:
+def scene_of(capture: Capture, given: np.ndarray | None = None) -> Scene:
     """A capture as a scene in memory."""
-    from kronc_ns.keypoints.schema import APOLLOCAR3D_66
-
     names = tuple(f"images/frame_{i + 1:05d}.png" for i in range(len(capture.c2w)))
     return Scene(names, capture.camera, APOLLOCAR3D_66, capture.keypoints, given)

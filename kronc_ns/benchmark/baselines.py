@@ -11,7 +11,7 @@ from torch import Tensor
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import rays
 from kronc_ns.geometry.poses import invert
-from kronc_ns.init import triangulate
+from kronc_ns.geometry.triangulation import triangulate
 from kronc_ns.scene import Scene
 
 Loss = Literal["trivial", "cauchy"]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from rich.console import Console
 from typing_extensions import assert_never
 
-from kronc_ns.console import progress_bar
+from kronc_ns.commands.console import progress_bar
 from kronc_ns.errors import KroncError
 
 if TYPE_CHECKING:

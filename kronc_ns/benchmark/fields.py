@@ -20,9 +20,9 @@ from kronc_ns.benchmark.settings import ADAM_FROM_CIRCLE
 from kronc_ns.benchmark.subjects import Subject, from_folder
 from kronc_ns.benchmark.training import train, write_poses
 from kronc_ns.errors import KroncError
-from kronc_ns.files import atomic_path, write_json
+from kronc_ns.files.output import atomic_path, write_json
+from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import umeyama
-from kronc_ns.init import circular_poses
 
 PosesOf = Method | Literal["reference", "circle"]
 _PAPER = {

@@ -14,14 +14,14 @@ import torch
 from kronc_ns.benchmark.commands import Commands
 from kronc_ns.benchmark.rows import Figures, Runs
 from kronc_ns.benchmark.training import Poses, train, write_variant
-from kronc_ns.evaluate import evaluate_poses
-from kronc_ns.init import noisy_poses
-from kronc_ns.keypoints.io import write_keypoints
+from kronc_ns.files.keypoints import write_keypoints
+from kronc_ns.files.transforms import read_poses
+from kronc_ns.fit.options import KroncConfig
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
-from kronc_ns.pipeline import KroncConfig
-from kronc_ns.scene import read_poses
+from kronc_ns.metrics.poses import evaluate_poses
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, default_camera, make_capture
+from kronc_ns.synthetic.variations import noisy_poses
 
 START = (4.0, 0.5)
 """Noise of the poses before they are solved: degrees, metres."""

@@ -20,9 +20,10 @@ from kronc_ns.benchmark.colmap import load_pycolmap, map_images, map_keypoints
 from kronc_ns.benchmark.memory import with_peak
 from kronc_ns.benchmark.subjects import Subject
 from kronc_ns.errors import KroncError
-from kronc_ns.evaluate import AUC_LIMITS_DEG, evaluate_poses
-from kronc_ns.init import circular_poses
-from kronc_ns.pipeline import KroncConfig, solve_scene
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.fit.pipeline import solve_scene
+from kronc_ns.fit.starts import circular_poses
+from kronc_ns.metrics.poses import AUC_LIMITS_DEG, evaluate_poses
 from kronc_ns.scene import Scene
 
 Method = Literal[

@@ -11,9 +11,10 @@ from kronc_ns.benchmark.problems import best_poses, noisy_start, raw_errors, sol
 from kronc_ns.benchmark.rows import Figures, Runs
 from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.errors import KroncError
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.geometry.alignment import umeyama
-from kronc_ns.pipeline import KroncConfig, solve_scene
-from kronc_ns.solve.solution import Solution, ViewStatus
+from kronc_ns.solution import Solution, ViewStatus
 from kronc_ns.synthetic.scenes import Capture, Preset, make_capture
 from kronc_ns.synthetic.variations import empty_views, limit_points, swap_sides
 

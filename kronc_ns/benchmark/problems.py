@@ -13,12 +13,12 @@ from torch import Tensor
 from kronc_ns.benchmark.baselines import bundle_adjustment
 from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.errors import KroncError
+from kronc_ns.files.output import read_json
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.geometry.rotations import rotation_angle_deg
-from kronc_ns.init import noisy_poses
-from kronc_ns.keypoints.io import read_json
-from kronc_ns.pipeline import KroncConfig, solve_scene
-from kronc_ns.solve.solution import Solution, Status
+from kronc_ns.solution import Solution, Status
 from kronc_ns.synthetic.car import CarShape, build_car
 from kronc_ns.synthetic.scenes import (
     HEMISPHERE_RADIUS_M,
@@ -29,7 +29,7 @@ from kronc_ns.synthetic.scenes import (
     observe,
     walk_poses,
 )
-from kronc_ns.synthetic.variations import on_wheels
+from kronc_ns.synthetic.variations import noisy_poses, on_wheels
 
 REPORT_SEEDS = 100
 """Seeds below are for reports; what is tuned is tuned on seeds from here on."""

@@ -7,7 +7,7 @@ from functools import partial
 from kronc_ns.benchmark import paper
 from kronc_ns.benchmark.peers import START, Method
 from kronc_ns.benchmark.tables import Setting, TableOptions
-from kronc_ns.options import KroncConfig
+from kronc_ns.fit.options import KroncConfig
 from kronc_ns.solve.adam import AdamConfig
 
 # The paper's rate for synthetic scenes; with that for real ones (0.001) cameras do not get off the circle far enough.

@@ -9,7 +9,6 @@ from statistics import median
 
 import torch
 
-from kronc_ns.adjustment import shape_prior
 from kronc_ns.benchmark.baselines import LinearSolver, bundle_adjustment
 from kronc_ns.benchmark.memory import with_peak
 from kronc_ns.benchmark.pose_measures import USUAL_START, Verdict
@@ -17,14 +16,16 @@ from kronc_ns.benchmark.problems import Shapes, capture_shape, noisy_start, solu
 from kronc_ns.benchmark.rows import Figures, Runs
 from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.errors import KroncError
+from kronc_ns.fit.attempts import shape_prior
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.fit.pipeline import solve_scene, solve_scenes
+from kronc_ns.fit.starts import start_from_poses
 from kronc_ns.geometry.alignment import pose_errors
-from kronc_ns.pipeline import KroncConfig, solve_scene, solve_scenes
 from kronc_ns.scene import Scene
+from kronc_ns.solution import Solution
 from kronc_ns.solve.lm import adjust
 from kronc_ns.solve.problem import Problem, State
-from kronc_ns.solve.solution import Solution
 from kronc_ns.solve.threads import one_thread
-from kronc_ns.starts import start_from_poses
 from kronc_ns.synthetic.scenes import Capture, make_capture
 
 _DEFAULT = KroncConfig()

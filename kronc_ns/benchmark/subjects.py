@@ -8,12 +8,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from kronc_ns.errors import KroncError
-from kronc_ns.frame import template_frame
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.files.transforms import read_poses
+from kronc_ns.fit.car_frame import template_frame
 from kronc_ns.geometry.camera import rays
-from kronc_ns.init import triangulate
+from kronc_ns.geometry.triangulation import triangulate
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.keypoints.template import car_template
-from kronc_ns.scene import Scene, load_scene, read_poses
+from kronc_ns.scene import Scene
 from kronc_ns.synthetic.scenes import Capture, Preset, make_capture
 
 _UNLIKE_A_CAR = 1.5

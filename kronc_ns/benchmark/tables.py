@@ -13,11 +13,11 @@ from rich.console import Console
 from kronc_ns.benchmark.peers import START, Method, figures, place
 from kronc_ns.benchmark.rows import hardware, plain
 from kronc_ns.benchmark.subjects import Subject, from_folder, procedural, thinned, with_noise
-from kronc_ns.console import progress_bar
+from kronc_ns.commands.console import progress_bar
 from kronc_ns.errors import KroncError
-from kronc_ns.files import atomic_path, write_json
-from kronc_ns.init import noisy_poses
-from kronc_ns.options import KroncConfig
+from kronc_ns.files.output import atomic_path, write_json
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.synthetic.variations import noisy_poses
 
 
 @dataclass(kw_only=True)

@@ -9,10 +9,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from kronc_ns.benchmark.commands import Commands
-from kronc_ns.export import claim_output, write_solution
-from kronc_ns.pipeline import KroncConfig, solve_scene
-from kronc_ns.scene import Scene, load_scene, read_poses
-from kronc_ns.solve.solution import Solution, Status, ViewReport, ViewStatus
+from kronc_ns.files.output import claim_output
+from kronc_ns.files.record import write_solution
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.files.transforms import read_poses
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.fit.pipeline import solve_scene
+from kronc_ns.scene import Scene
+from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
 
 Poses = Literal["exact", "solved", "given"]
 

@@ -16,15 +16,15 @@ from PIL import Image
 from torch import Tensor
 
 from kronc_ns.capture.images import copy_upright, upright_size
-from kronc_ns.capture.masks import read_mask
 from kronc_ns.capture.source import IMAGE_SUFFIXES, list_images
 from kronc_ns.errors import KroncError
-from kronc_ns.export import claim_output, release_output, transforms_dict
-from kronc_ns.files import write_json
+from kronc_ns.files.images import read_mask
+from kronc_ns.files.keypoints import FORMATS, read_keypoints, write_keypoints
+from kronc_ns.files.output import claim_output, read_json, release_output, write_json
+from kronc_ns.files.scene_folder import match_keypoints
+from kronc_ns.files.transforms import read_poses, transforms_dict
 from kronc_ns.geometry.camera import Camera
-from kronc_ns.keypoints.io import FORMATS, read_json, read_keypoints, write_keypoints
 from kronc_ns.keypoints.schema import KeypointSchema
-from kronc_ns.scene import match_keypoints, read_poses
 
 _COLMAP_FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse", "colmap", ".")
 _COLMAP_MODELS = {  # parameters of COLMAP's camera models, by our names

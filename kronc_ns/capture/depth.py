@@ -16,9 +16,11 @@ from kronc_ns.capture.detection.pixels import read_rgb
 from kronc_ns.capture.pretrained import load_pretrained, transformers_for
 from kronc_ns.capture.source import Count
 from kronc_ns.errors import KroncError
-from kronc_ns.files import atomic_path, cache_folder
-from kronc_ns.options import KroncConfig
-from kronc_ns.scene import Scene, depth_under
+from kronc_ns.files.cache import cache_folder
+from kronc_ns.files.images import depth_under
+from kronc_ns.files.output import atomic_path
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.scene import Scene
 
 MODEL = "facebook/dpt-dinov2-base-kitti"
 _PATCH = 14  # px of DINOv2's patches, of which the input holds a whole number

@@ -26,8 +26,7 @@ from kronc_ns.capture.selection import Sampling
 from kronc_ns.capture.source import IMAGE_SUFFIXES, MIN_FRAMES, Count, Source
 from kronc_ns.capture.video import VideoFrames, probe_video
 from kronc_ns.errors import KroncError
-from kronc_ns.files import write_json
-from kronc_ns.keypoints.io import read_json
+from kronc_ns.files.output import read_json, write_json
 
 RECORD = ".kronc-frames.json"
 """Says which source the frames of an output folder are from, so that a second run need not make them again."""

@@ -9,9 +9,9 @@ from typing import Any
 from PIL import ExifTags, Image
 
 from kronc_ns.errors import KroncError
+from kronc_ns.files.output import read_json
+from kronc_ns.files.transforms import camera_and_frames
 from kronc_ns.geometry.camera import Camera
-from kronc_ns.keypoints.io import read_json
-from kronc_ns.scene import camera_and_frames
 
 FULL_FRAME_DIAGONAL_MM = 43.27
 """Diagonal of 36 mm x 24 mm: what 35 mm equivalent focal lengths refer to (CIPA's convention for all aspect ratios)."""

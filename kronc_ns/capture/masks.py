@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
@@ -12,6 +11,7 @@ from kronc_ns.capture.frames import Frames
 from kronc_ns.capture.images import level_path
 from kronc_ns.capture.source import IMAGE_SUFFIXES
 from kronc_ns.errors import KroncError
+from kronc_ns.files.images import read_mask
 
 
 def find_masks(masks: Path | tuple[Path, ...], frames: Frames) -> tuple[Path, ...]:
@@ -44,21 +44,6 @@ def write_masks(files: Sequence[Path], frames: Frames, out: Path) -> tuple[str, 
             path.parent.mkdir(exist_ok=True)
             Image.fromarray(downscale_mask(mask, factor)).save(path)
     return names
-
-
-def read_mask(file: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
-    """255 where the file is above 127, else 0."""
-    mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise KroncError(f"{file} is no image that can be read: expected a mask, 0 outside the car and 255 on it")
-    if mask.shape[::-1] != size:
-        raise KroncError(
-            f"{file} is {mask.shape[1]}x{mask.shape[0]}, its image {size[0]}x{size[1]}: "
-            "expected masks in the pixels of the images"
-        )
-    if 0 < mask.max() <= 127:
-        raise KroncError(f"{file} has no value above {mask.max()}: expected 0 outside the car and 255 on it")
-    return np.where(mask > 127, 255, 0).astype(np.uint8)
 
 
 def downscale_mask(mask: UInt8[np.ndarray, "h w"], factor: int) -> UInt8[np.ndarray, "h2 w2"]:

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from kronc_ns.capture.images import HEIF_SUFFIXES, read_heif
 from kronc_ns.errors import KroncError
+from kronc_ns.files.output import read_json
+from kronc_ns.files.transforms import camera_and_frames, read_poses
 from kronc_ns.geometry.camera import Camera
-from kronc_ns.keypoints.io import read_json
-from kronc_ns.scene import camera_and_frames, read_poses
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 """Image files that are taken, in lower case."""

@@ -1,1 +1,1 @@
-"""Rotations, poses, cameras and alignment: pure functions on torch tensors of any device and dtype."""
+"""Rotations, poses, cameras, alignment and triangulation: pure functions on NumPy arrays."""

@@ -5,13 +5,11 @@ Pixels: the centre of the top-left pixel is (0.5, 0.5), as in nerfstudio and COL
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from kronc_ns.errors import KroncError
+from kronc_ns.geometry.poses import invert, transform
 
 
 @dataclass(frozen=True)
@@ -56,24 +54,28 @@ class Camera:
         """The paper's K."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def undistort(self, uv: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
-        """Pixels as an ideal pinhole camera with the same K would see them (CPU, float64)."""
+    def undistort(self, uv: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
+        """Pixels as an ideal pinhole camera with the same K would see them."""
         if not any(self.distortion):
             return uv
-        flat = uv.reshape(-1, 1, 2).double().cpu().numpy()
+        import cv2  # only lenses with distortion need it
+
+        flat = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 1, 2)
         # OpenCV's default of five iterations leaves up to a pixel in the corners of wide lenses
         exactly = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
         ideal = cv2.undistortPointsIter(flat, self.matrix, np.array(self.distortion), np.eye(3), self.matrix, exactly)
-        return torch.from_numpy(ideal.reshape(uv.shape)).to(uv)
+        return ideal.reshape(uv.shape)
 
-    def distort(self, uv: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    def distort(self, uv: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
         """Pixels of the ideal pinhole camera as this one sees them: the inverse of `undistort`."""
         if not any(self.distortion):
             return uv
-        flat = uv.reshape(-1, 2).double().cpu().numpy()
+        import cv2
+
+        flat = uv.reshape(-1, 2)
         at_depth_1 = np.column_stack([(flat - (self.cx, self.cy)) / (self.fx, self.fy), np.ones(len(flat))])
         seen, _ = cv2.projectPoints(at_depth_1, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
-        return torch.from_numpy(seen.reshape(uv.shape)).to(uv)
+        return seen.reshape(uv.shape)
 
     def scaled(self, factor: float) -> "Camera":
         """The camera of the same image resized by ``factor``."""
@@ -88,21 +90,23 @@ class Camera:
         )
 
 
-def rays(uv: Float[Tensor, "*b 2"], camera: Camera) -> Float[Tensor, "*b 3"]:
+def rays(uv: Float[np.ndarray, "*b 2"], camera: Camera) -> Float[np.ndarray, "*b 3"]:
     """K^-1 (u, v, 1): camera-frame direction of each pixel with z = 1 (distortion is not considered)."""
     x = (uv[..., 0] - camera.cx) / camera.fx
     y = (uv[..., 1] - camera.cy) / camera.fy
-    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
-def project(points_camera: Float[Tensor, "*b 3"], camera: Camera) -> Float[Tensor, "*b 2"]:
+def project(points_camera: Float[np.ndarray, "*b 3"], camera: Camera) -> Float[np.ndarray, "*b 2"]:
     """Pixels of camera-frame points; meaningless where z <= 0, which the caller has to check."""
-    x, y, z = points_camera.unbind(-1)
-    return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
+    x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
 
 
-def backproject(
-    uv: Float[Tensor, "n j 2"], depth: Float[Tensor, "n j"], c2w: Float[Tensor, "n 3 4"], camera: Camera
-) -> Float[Tensor, "n j 3"]:
-    """World points of pixels at z-depth ``depth``: the paper's equation 1."""
-    return (rays(uv, camera) * depth[..., None]) @ c2w[..., :3].transpose(-1, -2) + c2w[:, None, :, 3]
+def reproject(
+    points: Float[np.ndarray, "j 3"], c2w: Float[np.ndarray, "n 3 4"], camera: Camera
+) -> Float[np.ndarray, "n j 2"]:
+    """Pixels of every point in every view (the paper's equation 3 of its centroids); inf behind a camera."""
+    in_camera = transform(invert(c2w), np.broadcast_to(points, (len(c2w), *points.shape)))
+    return np.where(in_camera[..., 2:] > 0, project(in_camera, camera), np.inf)

@@ -4,44 +4,63 @@ A pose is ``[R | t]``; ``c2w`` maps camera to world. The core's camera axes are 
 z forward); nerfstudio's are OpenGL's (x right, y up, z backward).
 """
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+import numpy as np
+from jaxtyping import Bool, Float
 
 
-def make_pose(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 4"]:
+def make_pose(
+    rotation: Float[np.ndarray, "*b 3 3"], translation: Float[np.ndarray, "*b 3"]
+) -> Float[np.ndarray, "*b 3 4"]:
     """Pose [R | t]."""
-    return torch.cat([rotation, translation[..., None]], dim=-1)
+    return np.concatenate([rotation, translation[..., None]], axis=-1)
 
 
-def invert(pose: Float[Tensor, "*b 3 4"]) -> Float[Tensor, "*b 3 4"]:
+def invert(pose: Float[np.ndarray, "*b 3 4"]) -> Float[np.ndarray, "*b 3 4"]:
     """Inverse of a rigid pose: [R^T | -R^T t]."""
-    inverse = pose[..., :3].transpose(-1, -2)
-    return torch.cat([inverse, -inverse @ pose[..., 3:]], dim=-1)
+    inverse = pose[..., :3].swapaxes(-1, -2)
+    return np.concatenate([inverse, -inverse @ pose[..., 3:]], axis=-1)
 
 
-def compose(a_from_b: Float[Tensor, "*b 3 4"], b_from_c: Float[Tensor, "*b 3 4"]) -> Float[Tensor, "*b 3 4"]:
+def compose(
+    a_from_b: Float[np.ndarray, "*b 3 4"], b_from_c: Float[np.ndarray, "*b 3 4"]
+) -> Float[np.ndarray, "*b 3 4"]:
     """Pose a_from_c = a_from_b . b_from_c."""
     rotation = a_from_b[..., :3] @ b_from_c[..., :3]
     translation = a_from_b[..., :3] @ b_from_c[..., 3:] + a_from_b[..., 3:]
-    return torch.cat([rotation, translation], dim=-1)
+    return np.concatenate([rotation, translation], axis=-1)
 
 
-def transform(pose: Float[Tensor, "*b 3 4"], points: Float[Tensor, "*b n 3"]) -> Float[Tensor, "*b n 3"]:
+def transform(pose: Float[np.ndarray, "*b 3 4"], points: Float[np.ndarray, "*b n 3"]) -> Float[np.ndarray, "*b n 3"]:
     """Points [n, 3] carried through a pose: R x + t."""
-    return points @ pose[..., :3].transpose(-1, -2) + pose[..., None, :, 3]
+    return points @ pose[..., :3].swapaxes(-1, -2) + pose[..., None, :, 3]
+
+
+def posed(c2w: Float[np.ndarray, "*n 3 4"]) -> Bool[np.ndarray, "*n"]:
+    """Which views have a pose (the others hold NaN)."""
+    return np.isfinite(c2w).all((-2, -1))
+
+
+def camera_z(c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "n j"]:
+    """z-depth of every point before every camera."""
+    forward = c2w[..., 2]
+    return forward @ points.T - (forward * c2w[..., 3]).sum(-1)[:, None]
+
+
+def unit(vector: Float[np.ndarray, "*b k"]) -> Float[np.ndarray, "*b k"]:
+    """Vectors at length 1; zero stays zero."""
+    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12)
 
 
 def look_at(
-    centres: Float[Tensor, "*b 3"], targets: Float[Tensor, "*b 3"], up: Float[Tensor, "3"]
-) -> Float[Tensor, "*b 3 4"]:
+    centres: Float[np.ndarray, "*b 3"], targets: Float[np.ndarray, "*b 3"], up: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "*b 3 4"]:
     """OpenCV c2w of cameras at ``centres`` facing ``targets``, with image-down as far from ``up`` as possible."""
-    forward = torch.nn.functional.normalize(targets - centres, dim=-1)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)
-    down = torch.linalg.cross(forward, right)
-    return make_pose(torch.stack([right, down, forward], dim=-1), centres)
+    forward = unit(targets - centres)
+    right = unit(np.cross(forward, up))
+    down = np.cross(forward, right)
+    return make_pose(np.stack([right, down, forward], axis=-1), centres)
 
 
-def flip_camera_axes(c2w: Float[Tensor, "*b 3 4"]) -> Float[Tensor, "*b 3 4"]:
+def flip_camera_axes(c2w: Float[np.ndarray, "*b 3 4"]) -> Float[np.ndarray, "*b 3 4"]:
     """OpenCV c2w to OpenGL c2w, or back: negates the camera's y and z axes (its own inverse)."""
-    return c2w * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=c2w.dtype, device=c2w.device)
+    return c2w * np.array([1.0, -1.0, -1.0, 1.0])

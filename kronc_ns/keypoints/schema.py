@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Float
+
 from kronc_ns.errors import KroncError
 
 
@@ -31,6 +34,10 @@ class KeypointSchema:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def mirrored(self, keypoints: Float[np.ndarray, "*n j k"]) -> Float[np.ndarray, "*n j k"]:
+        """Detections with left and right exchanged."""
+        return keypoints[..., list(self.flip), :]
 
     @property
     def mirror_pairs(self) -> tuple[tuple[int, int], ...]:

@@ -7,10 +7,10 @@ ground. The car is authored from published dimensions and from how cars are buil
 from dataclasses import astuple, dataclass
 from functools import cached_property, lru_cache
 
-import torch
+import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
+from kronc_ns.geometry.poses import unit
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
 
 PUBLISHED_MM: dict[str, tuple[int, int, int, int]] = {
@@ -91,16 +91,15 @@ DEVIATIONS = CarDimensions(
 """One standard deviation of each dimension over city cars, hatchbacks, saloons and SUVs."""
 
 
-def dimension_covariance() -> Float[Tensor, "d d"]:
+def dimension_covariance() -> Float[np.ndarray, "d d"]:
     """Covariance of the dimensions in the order of their fields: the published ones together, the rest independent."""
-    covariance = torch.tensor(astuple(DEVIATIONS), dtype=torch.float64).square().diag()
-    published = torch.tensor(list(PUBLISHED_MM.values()), dtype=torch.float64) / 1000
-    covariance[:4, :4] = published.T.cov()
+    covariance = np.diag(np.square(astuple(DEVIATIONS)))
+    covariance[:4, :4] = np.cov(np.array(list(PUBLISHED_MM.values())).T / 1000)
     return covariance
 
 
-def keypoints_of(dimensions: CarDimensions) -> Float[Tensor, "66 3"]:
-    """The 66 points of a car with these dimensions, metres, car frame, float64; exactly mirror symmetric."""
+def keypoints_of(dimensions: CarDimensions) -> Float[np.ndarray, "66 3"]:
+    """The 66 points of a car with these dimensions, metres, car frame; exactly mirror symmetric."""
     d, half, half_w = dimensions, dimensions.length / 2, dimensions.width / 2
     front_axle = half - d.front_share * (d.length - d.wheelbase)
     rear_axle, arch, belt = front_axle - d.wheelbase, d.wheel_radius + 0.04, d.height - d.glass_height
@@ -149,11 +148,11 @@ def keypoints_of(dimensions: CarDimensions) -> Float[Tensor, "66 3"]:
     })  # fmt: skip
 
 
-def _both_sides(left: dict[int, tuple[float, float, float]]) -> Float[Tensor, "66 3"]:
+def _both_sides(left: dict[int, tuple[float, float, float]]) -> Float[np.ndarray, "66 3"]:
     """Points or directions of the left side, by their index among the 66, and their mirror images."""
-    both = torch.empty(len(APOLLOCAR3D_66), 3, dtype=torch.float64)
+    both = np.empty((len(APOLLOCAR3D_66), 3))
     for j, (x, y, z) in left.items():
-        both[j], both[APOLLOCAR3D_66.flip[j]] = torch.tensor(((x, y, z), (x, -y, z)), dtype=torch.float64)
+        both[j], both[APOLLOCAR3D_66.flip[j]] = (x, y, z), (x, -y, z)
     return both
 
 
@@ -169,19 +168,19 @@ _LEFT_NORMALS: dict[tuple[float, float, float], tuple[int, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class CarTemplate:
-    """Gaussian distribution over the J points of a car, metres, car frame, float64 on the CPU.
+    """Gaussian distribution over the J points of a car, metres, car frame.
 
     points = mean + sum_k c_k basis[k] + residual with c_k ~ N(0, 1). On each axis a left point moves by s + a beyond
     the dimensions, its partner by the mirror image of s - a.
     """
 
-    mean: Float[Tensor, "j 3"]
+    mean: Float[np.ndarray, "j 3"]
     """The average car."""
-    basis: Float[Tensor, "k j 3"]
+    basis: Float[np.ndarray, "k j 3"]
     """Displacements per standard deviation of K independent coefficients of the dimensions."""
-    length_basis: Float[Tensor, "k"]
+    length_basis: Float[np.ndarray, "k"]
     """What each coefficient adds to the length from bumper to bumper."""
-    normals: Float[Tensor, "j 3"]
+    normals: Float[np.ndarray, "j 3"]
     """Outward unit normals of the surface at the points."""
     flip: tuple[int, ...]
     """Index of each point's mirror partner, itself where it has none."""
@@ -190,44 +189,47 @@ class CarTemplate:
     sigma_asymmetric_m: float = 0.03
     """Standard deviation of a, by which the sides differ."""
 
-    def covariance(self) -> Float[Tensor, "n n"]:
+    def covariance(self) -> Float[np.ndarray, "n n"]:
         """Covariance of the points, n = 3J, at index 3 * j + axis; positive definite. Computed once."""
         return self._moments[0]
 
-    def precision(self) -> Float[Tensor, "n n"]:
+    def precision(self) -> Float[np.ndarray, "n n"]:
         """Inverse of the covariance. Computed once."""
         return self._moments[1]
 
     @cached_property
-    def _moments(self) -> tuple[Tensor, Tensor]:
+    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
         count = len(self.mean)
-        own, partner = torch.arange(count), torch.tensor(self.flip)
-        mirror = torch.zeros(count, 3, count, 3, dtype=torch.float64)
+        own, partner = np.arange(count), np.array(self.flip)
+        mirror = np.zeros((count, 3, count, 3))
         for axis, sign in enumerate((1.0, -1.0, 1.0)):
-            mirror[own, axis, partner, axis] = torch.where(own == partner, 0.0, sign).to(mirror)
+            mirror[own, axis, partner, axis] = np.where(own == partner, 0.0, sign)
         symmetric, asymmetric = self.sigma_symmetric_m**2, self.sigma_asymmetric_m**2
         residual = (symmetric - asymmetric) * mirror.reshape(3 * count, 3 * count)
-        residual.diagonal().add_(symmetric + asymmetric)
-        covariance = self.basis.flatten(1).T @ self.basis.flatten(1) + residual
-        return covariance, torch.cholesky_inverse(torch.linalg.cholesky(covariance))
+        residual += (symmetric + asymmetric) * np.eye(3 * count)
+        basis = self.basis.reshape(len(self.basis), -1)
+        covariance = basis.T @ basis + residual
+        precision = np.linalg.inv(covariance)
+        return covariance, (precision + precision.T) / 2
 
-    def length_m(self, points: Float[Tensor, "j 3"]) -> float:
+    def length_m(self, points: Float[np.ndarray, "j 3"]) -> float:
         """Expected length from bumper to bumper given solved points in the car frame (NaN rows: unknown), metres.
 
         The outermost points lie some way inside the bumper ends; how far, the other points tell. The ends are two more
         points of the same Gaussian. Two parts of it count only here: a shift of all points together, since the origin
         is where the ends say, and a smooth bend of the body that the dimensions do not describe.
         """
-        known, average = points.isfinite().all(-1).repeat_interleave(3), CarDimensions().length
-        offset = (points.detach().to(self.mean) - self.mean).flatten()[known]
-        ends = torch.tensor([[average / 2, 0.0, 0.5], [-average / 2, 0.0, 0.5]], dtype=torch.float64)
+        known, average = np.isfinite(points).all(-1).repeat(3), CarDimensions().length
+        offset = (points - self.mean).ravel()[known]
+        ends = np.array([[average / 2, 0.0, 0.5], [-average / 2, 0.0, 0.5]])
         # 1 m of shift; 8 cm of bend, alike at points within 0.6 m of each other.
-        squared = torch.cdist(torch.cat([self.mean, ends]), self.mean).square()
-        common = 1.0 + 0.08**2 * torch.exp(squared / (-2 * 0.6**2))
-        axes = torch.eye(3, dtype=torch.float64)
-        covariance = self.covariance() + torch.kron(common[:-2], axes)
-        cross = self.length_basis @ self.basis.flatten(1) + torch.kron(common[-2] - common[-1], axes[0])
-        return average + float(cross[known] @ torch.linalg.solve(covariance[known][:, known], offset))
+        squared = np.square(np.concatenate([self.mean, ends])[:, None] - self.mean).sum(-1)
+        common = 1.0 + 0.08**2 * np.exp(squared / (-2 * 0.6**2))
+        axes = np.eye(3)
+        covariance = self.covariance() + np.kron(common[:-2], axes)
+        basis = self.basis.reshape(len(self.basis), -1)
+        cross = self.length_basis @ basis + np.kron(common[-2] - common[-1], axes[0])
+        return average + float(cross[known] @ np.linalg.solve(covariance[known][:, known], offset))
 
 
 @lru_cache(maxsize=8)
@@ -239,12 +241,12 @@ def car_template(schema: KeypointSchema) -> CarTemplate | None:
     if -1 in index or len(set(index)) < len(index) or not paired:
         return None
     directions = _both_sides({j: direction for direction, group in _LEFT_NORMALS.items() for j in group})
-    normals = torch.nn.functional.normalize(directions, dim=1)[index]
+    normals = unit(directions)[index]
     # Central differences: the points are almost quadratic in the dimensions.
-    at, step = torch.tensor(astuple(CarDimensions()), dtype=torch.float64), 1e-4
-    changed = at + step * torch.tensor([[[-1.0]], [[1.0]]]) * torch.eye(len(at), dtype=torch.float64)
-    less, more = (torch.stack([keypoints_of(CarDimensions(*row)) for row in rows]) for rows in changed.tolist())
+    at, step = np.array(astuple(CarDimensions())), 1e-4
+    changed = at + step * np.array([[[-1.0]], [[1.0]]]) * np.eye(len(at))
+    less, more = (np.stack([keypoints_of(CarDimensions(*row)) for row in rows]) for rows in changed.tolist())
     # The factor is lower triangular and length the first dimension: only the first coefficient changes the length.
-    factor = torch.linalg.cholesky(dimension_covariance())
-    basis = torch.einsum("dk,djc->kjc", factor, (more - less) / (2 * step))[:, index]
+    factor = np.linalg.cholesky(dimension_covariance())
+    basis = np.einsum("dk,djc->kjc", factor, (more - less) / (2 * step))[:, index]
     return CarTemplate(keypoints_of(CarDimensions())[index], basis, factor[0], normals, schema.flip)

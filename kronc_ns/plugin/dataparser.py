@@ -19,19 +19,21 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from kronc_ns.config import SolverOptions
-from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
+from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, report_table
+from kronc_ns.commands.options import SolverOptions
 from kronc_ns.errors import KroncError
+from kronc_ns.files.cache import read_report, solve_cached
+from kronc_ns.files.output import read_json
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.files.transforms import camera_and_frames, check_file_names, read_poses
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import flip_camera_axes
-from kronc_ns.keypoints.io import read_json
-from kronc_ns.plugin.cache import read_report, solve_cached
 from kronc_ns.plugin.checks import check_masks, check_not_negative, check_positive
 from kronc_ns.plugin.images import cut_out, downscaled
 from kronc_ns.plugin.seeds import Seeds, box_seeds, grey, ground_seeds
 from kronc_ns.plugin.visual_hull import carve, read_pictures
-from kronc_ns.scene import Scene, camera_and_frames, check_file_names, load_scene, read_poses
-from kronc_ns.solve.solution import Status
+from kronc_ns.scene import Scene
+from kronc_ns.solution import Status
 
 _BOX_MARGIN = 0.1  # of the car's length: keypoints stop short of tyres, mirrors and the roof
 

@@ -15,8 +15,8 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files import atomic_path
-from kronc_ns.image_metrics import ImageMetrics, frame_metrics, mean_metrics, vehicle_metrics
+from kronc_ns.files.output import atomic_path
+from kronc_ns.metrics.images import ImageMetrics, frame_metrics, mean_metrics, vehicle_metrics
 from kronc_ns.plugin.trained import RenderedView, load_run
 
 ERROR_LIMIT = 0.25

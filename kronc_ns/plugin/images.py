@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files import atomic_path, cache_folder
+from kronc_ns.files.cache import cache_folder
+from kronc_ns.files.output import atomic_path
 from kronc_ns.scene import Scene
 
 _MAX_AUTO_SIDE = 1600  # nerfstudio's own limit for choosing a downscaled folder

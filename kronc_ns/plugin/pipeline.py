@@ -15,7 +15,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from kronc_ns.console import exit_on_error
+from kronc_ns.commands.console import exit_on_error
 from kronc_ns.errors import KroncError
 
 _STEPS, _RATE, _RATE_FINAL = 60, 2e-3, 1e-4  # of a test pose: radians, and shares of the distance to the car

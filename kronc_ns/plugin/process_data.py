@@ -20,17 +20,20 @@ from kronc_ns.capture.segmentation.choice import SegmenterOptions, segment_car
 from kronc_ns.capture.segmentation.segmenter import Segmenter
 from kronc_ns.capture.selection import Sampling
 from kronc_ns.capture.source import Source, find_source
-from kronc_ns.config import SolverOptions
-from kronc_ns.console import exit_on_error, exit_status, progress_bar, report_table
+from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, report_table
+from kronc_ns.commands.options import SolverOptions
 from kronc_ns.errors import KroncError
-from kronc_ns.export import claim_output, transforms_dict, write_solution
-from kronc_ns.files import write_json
+from kronc_ns.files.cache import fingerprint
+from kronc_ns.files.keypoints import FORMATS, Detections, read_keypoints, write_keypoints
+from kronc_ns.files.output import claim_output, write_json
+from kronc_ns.files.record import write_solution
+from kronc_ns.files.scene_folder import load_scene, match_keypoints
+from kronc_ns.files.transforms import transforms_dict
+from kronc_ns.fit.pipeline import solve_scene
+from kronc_ns.fit.starts import MIN_POINTS
 from kronc_ns.geometry.camera import Camera
-from kronc_ns.keypoints.io import FORMATS, Detections, read_keypoints, write_keypoints
-from kronc_ns.pipeline import fingerprint, solve_scene
-from kronc_ns.report import write_report
-from kronc_ns.scene import Scene, load_scene, match_keypoints
-from kronc_ns.starts import MIN_POINTS
+from kronc_ns.scene import Scene
+from kronc_ns.show.report import write_report
 
 
 @dataclass

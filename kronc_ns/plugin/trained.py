@@ -18,7 +18,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from kronc_ns.errors import KroncError
-from kronc_ns.image_metrics import Lpips
+from kronc_ns.metrics.images import Lpips
 from kronc_ns.plugin.compatibility import UnavailableLpips
 from kronc_ns.plugin.dataparser import KroncDataParserConfig
 

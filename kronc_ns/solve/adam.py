@@ -1,6 +1,6 @@
 """Algorithm 1 of the paper: Adam on rotations (6D), translations and depths, all views and keypoints at once.
 
-The gradient is written out (tests hold it against autograd on `kronc_ns.objective`) so that a step runs in
+The gradient is written out (tests hold it against autograd on `kronc_ns.solve.objective`) so that a step runs in
 preallocated buffers, without a graph: about three times the speed of autograd on a CPU.
 """
 
@@ -13,30 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from kronc_ns.geometry.rotations import rotation_from_r6, rotation_to_r6
+from kronc_ns.solve.options import AdamConfig
 from kronc_ns.solve.threads import one_thread
 
 _TINY = 1e-12
-
-
-@dataclass(frozen=True)
-class AdamConfig:
-    """Parameters of Algorithm 1."""
-
-    steps: int = 10_000
-    """Number of gradient steps S."""
-    learning_rate: float = 0.01
-    """Initial learning rate eta: 0.01 for the paper's synthetic scenes, 0.001 for its real ones."""
-    decay: float = 0.001
-    """Cosine annealing ends at this fraction of the learning rate."""
-    weight_2d: float = 1.0
-    """The paper's lambda: weight of a pixel in the image against a metre in the world (0: 3D loss only)."""
-    weight_3d: float = 1.0
-    """Weight of the 3D distances (0: 2D loss only, as in the paper's ablation)."""
-    optimise_depths: bool = True
-    """Whether depths are optimised with the poses; the paper's ablation also keeps given ones fixed."""
-    patience: int = 0
-    """Stop when the loss has not fallen by 0.1 % over this many steps; 0 (the paper) runs all steps."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +33,19 @@ class AdamResult:
     """"step" and "loss" at about a hundred steps."""
     path: Float[Tensor, "s n 3 4"]
     """Poses before each of them."""
+
+
+def rotation_to_r6(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6"]:
+    """First two columns (a1, a2) of a rotation, stacked: the paper's f (Algorithm 1; Zhou et al. 2019)."""
+    return torch.cat([rotation[..., :, 0], rotation[..., :, 1]], dim=-1)
+
+
+def rotation_from_r6(r6: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:
+    """Gram-Schmidt on the two unnormalised columns of ``r6``: the paper's inverse of f (section 4.2)."""
+    a1, a2 = r6[..., :3], r6[..., 3:]
+    b1 = torch.nn.functional.normalize(a1, dim=-1)
+    b2 = torch.nn.functional.normalize(a2 - (b1 * a2).sum(-1, keepdim=True) * b1, dim=-1)
+    return torch.stack([b1, b2, torch.linalg.cross(b1, b2)], dim=-1)
 
 
 class LossGradient:

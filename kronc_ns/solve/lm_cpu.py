@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kronc_ns.compiled import compiled
+from kronc_ns.solve.compiled import compiled
 
 Array = NDArray[Any]
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from typing_extensions import assert_never
 
 from kronc_ns.errors import KroncError
-from kronc_ns.export import claim_output, release_output, transforms_dict
-from kronc_ns.files import atomic_path, write_json
-from kronc_ns.keypoints.io import write_keypoints
+from kronc_ns.files.keypoints import write_keypoints
+from kronc_ns.files.output import atomic_path, claim_output, release_output, write_json
+from kronc_ns.files.transforms import transforms_dict
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.synthetic.blender import blender_views
 from kronc_ns.synthetic.mesh import MeshCar, write_mesh_car

@@ -16,8 +16,8 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files import atomic_path, write_json
-from kronc_ns.keypoints.io import describe_schema, read_json, read_schema
+from kronc_ns.files.keypoints import describe_schema, read_schema
+from kronc_ns.files.output import atomic_path, read_json, write_json
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.synthetic.car import CarModel
 from kronc_ns.synthetic.render import albedo, interpolated_normal

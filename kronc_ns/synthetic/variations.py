@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from kronc_ns.geometry.poses import compose, make_pose
+from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
 from kronc_ns.synthetic.scenes import Capture
 
@@ -68,3 +70,15 @@ def _choose(views: int, share: float, rng: np.random.Generator) -> Bool[Tensor, 
 def _keep(capture: Capture, kept: Bool[Tensor, "n #j"]) -> Capture:
     """The capture with detections outside ``kept`` taken out."""
     return replace(capture, keypoints=torch.where(kept[..., None], capture.keypoints, 0.0), wild=capture.wild & kept)
+
+
+def noisy_poses(
+    c2w: Float[np.ndarray, "n 3 4"], rotation_deg: float, translation_m: float, rng: np.random.Generator
+) -> Float[np.ndarray, "n 3 4"]:
+    """Known poses times noise from the right: cameras turn and move about themselves (paper, appendix B).
+
+    Each component of the rotation vector and of the translation is normal with the given standard deviation.
+    """
+    draw = rng.normal(size=(len(c2w), 6))
+    noise = make_pose(so3_exp(draw[:, :3] * np.deg2rad(rotation_deg)), draw[:, 3:] * translation_m)
+    return compose(c2w, noise)

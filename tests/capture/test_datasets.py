@@ -12,11 +12,12 @@ import torch
 
 from kronc_ns.capture.datasets import import_dataset
 from kronc_ns.errors import KroncError
-from kronc_ns.export import write_colmap
+from kronc_ns.files.colmap import write_colmap
+from kronc_ns.files.keypoints import write_keypoints
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.files.transforms import read_poses
 from kronc_ns.geometry.poses import flip_camera_axes
-from kronc_ns.keypoints.io import write_keypoints
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
-from kronc_ns.scene import load_scene, read_poses
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, default_camera, make_capture
 

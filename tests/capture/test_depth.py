@@ -12,10 +12,12 @@ from PIL import Image
 
 from kronc_ns.capture import depth as depth_module
 from kronc_ns.capture.depth import DinoDepth, depth_estimator, estimate_depths, with_depths
-from kronc_ns.cli import Solve
+from kronc_ns.commands.main import Solve
 from kronc_ns.errors import KroncError
-from kronc_ns.options import KroncConfig
-from kronc_ns.scene import Scene, load_scene, read_depth
+from kronc_ns.files.images import read_depth
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.scene import Scene
 from kronc_ns.solve.adam import AdamConfig
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture

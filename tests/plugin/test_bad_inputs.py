@@ -17,7 +17,7 @@ from PIL import Image
 pytest.importorskip("nerfstudio")
 
 from kronc_ns.benchmark.training import write_variant
-from kronc_ns.config import KroncConfig
+from kronc_ns.files.presets import KroncConfig
 from kronc_ns.plugin import methods
 from kronc_ns.plugin.compatibility import UnavailableLpips
 from kronc_ns.synthetic.folder import write_capture

@@ -12,15 +12,15 @@ from PIL import Image
 
 pytest.importorskip("nerfstudio")
 
-from kronc_ns.config import load_config
 from kronc_ns.errors import KroncError
-from kronc_ns.export import write_solution
+from kronc_ns.files.presets import load_config
+from kronc_ns.files.record import write_solution
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.geometry.poses import flip_camera_axes
-from kronc_ns.pipeline import solve_scene
 from kronc_ns.plugin.dataparser import KroncDataParser, KroncDataParserConfig
 from kronc_ns.plugin.images import cut_out
-from kronc_ns.scene import load_scene
-from kronc_ns.solve.solution import Solution, ViewStatus
+from kronc_ns.solution import Solution, ViewStatus
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
 

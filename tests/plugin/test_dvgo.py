@@ -17,17 +17,11 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes  # noqa: E402
 from nerfstudio.engine.optimizers import Optimizers  # noqa: E402
 
 from kronc_ns.benchmark.training import train, write_variant  # noqa: E402
-from kronc_ns.pipeline import KroncConfig  # noqa: E402
+from kronc_ns.fit.options import KroncConfig  # noqa: E402
 from kronc_ns.plugin.compatibility import UnavailableLpips  # noqa: E402
 from kronc_ns.plugin.dvgo import equations  # noqa: E402
 from kronc_ns.plugin.dvgo.field import view_rates  # noqa: E402
-from kronc_ns.plugin.dvgo.grid import (  # noqa: E402
-    RatedVoxelGrid,
-    UnknownSpace,
-    VoxelGrid,
-    sample_corners,
-    sample_fused,
-)
+from kronc_ns.plugin.dvgo.grid import RatedVoxelGrid, UnknownSpace, VoxelGrid, sample_corners, sample_fused  # noqa: E402
 from kronc_ns.plugin.dvgo.losses import StageLosses  # noqa: E402
 from kronc_ns.plugin.dvgo.model import DVGOModel, DVGOModelConfig  # noqa: E402
 from kronc_ns.plugin.dvgo.sampling import ray_box, sample_rays  # noqa: E402

@@ -12,9 +12,9 @@ import yaml
 from PIL import Image
 
 from kronc_ns.benchmark.training import train, write_variant
-from kronc_ns.console import metrics_table
+from kronc_ns.commands.console import metrics_table
 from kronc_ns.errors import KroncError
-from kronc_ns.pipeline import KroncConfig
+from kronc_ns.fit.options import KroncConfig
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
 

@@ -17,13 +17,14 @@ from PIL import Image
 
 from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.capture.segmentation.choice import SegmenterOptions
-from kronc_ns.config import SolverOptions
-from kronc_ns.evaluate import evaluate_poses
-from kronc_ns.export import MARKER
-from kronc_ns.keypoints.io import read_keypoints
+from kronc_ns.commands.options import SolverOptions
+from kronc_ns.files.keypoints import read_keypoints
+from kronc_ns.files.output import MARKER
+from kronc_ns.files.scene_folder import load_scene
+from kronc_ns.files.transforms import read_poses
+from kronc_ns.metrics.poses import evaluate_poses
 from kronc_ns.plugin import process_data
 from kronc_ns.plugin.process_data import KroncToNerfstudio
-from kronc_ns.scene import load_scene, read_poses
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, default_camera, make_capture
 from tests.capture.detection.dots import Net

@@ -11,7 +11,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models import splatfacto
 
 from kronc_ns.benchmark.training import train, write_variant
-from kronc_ns.config import load_config
+from kronc_ns.files.presets import load_config
 from kronc_ns.plugin.compatibility import allow_numpy_in_checkpoints, train_without_lpips_weights
 from kronc_ns.plugin.splat_cpu import kernels
 from kronc_ns.plugin.splat_cpu.harmonics import harmonic_colors

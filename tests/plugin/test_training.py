@@ -6,7 +6,7 @@ import math
 import pytest
 
 from kronc_ns.benchmark.training import train, write_variant
-from kronc_ns.config import load_config
+from kronc_ns.files.presets import load_config
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
 from tests.plugin.commands import add_half_size, evaluate, run

@@ -3,10 +3,11 @@
 import torch
 from torch import Tensor
 
+from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import Similarity
 from kronc_ns.geometry.rotations import so3_exp
-from kronc_ns.init import circular_poses, noisy_poses
 from kronc_ns.solve.problem import Problem, State
+from kronc_ns.synthetic.variations import noisy_poses
 
 FOCAL = (400.0, 390.0)
 SIMILARITY = Similarity(

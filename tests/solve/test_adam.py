@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from kronc_ns.geometry.alignment import pose_errors
-from kronc_ns.init import noisy_poses
 from kronc_ns.solve.adam import AdamConfig, minimise
+from kronc_ns.synthetic.variations import noisy_poses
 from tests.test_objective import CAMERA, problem
 
 

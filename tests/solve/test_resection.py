@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import Similarity
 from kronc_ns.geometry.poses import invert, look_at
 from kronc_ns.geometry.rotations import rotation_angle_deg, so3_exp
-from kronc_ns.init import circular_poses
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.solve.resection import Located, locate

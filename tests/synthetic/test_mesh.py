@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from kronc_ns import cli
+from kronc_ns.commands import main as cli
 from kronc_ns.errors import KroncError
-from kronc_ns.scene import load_scene
+from kronc_ns.files.scene_folder import load_scene
 from kronc_ns.synthetic.car import CarModel, build_car
 from kronc_ns.synthetic.car_parts import CarShape
 from kronc_ns.synthetic.mesh import KEYPOINTS_FILE, MeshCar, load_mesh_car, write_mesh_car

@@ -11,7 +11,7 @@ from typing_extensions import assert_never
 from kronc_ns.capture.detection.detector import CarImage, Detector
 from kronc_ns.capture.detection.store import Progress, detect_all
 from kronc_ns.errors import KroncError
-from kronc_ns.keypoints.io import Detections
+from kronc_ns.files.keypoints import Detections
 
 DetectorName: TypeAlias = Literal["openpifpaf", "onnx", "yolo-pose", "simcc"]
 

@@ -10,8 +10,8 @@ from kronc_ns.capture.detection.cif import decode_cif
 from kronc_ns.capture.detection.detector import CarDetection, CarImage, bounds
 from kronc_ns.capture.detection.model import OnnxModel, open_model
 from kronc_ns.capture.detection.pixels import MAX_LONG_SIDE, lies_on, normalise, read_rgb, shrink
-from kronc_ns.capture.masks import read_mask
 from kronc_ns.errors import KroncError
+from kronc_ns.files.images import read_mask
 from kronc_ns.keypoints.schema import KeypointSchema
 
 _DECODER = 1  # raise it when the same fields give other points

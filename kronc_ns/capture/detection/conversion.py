@@ -9,8 +9,8 @@ from kronc_ns.capture.detection.environment import find_environment
 from kronc_ns.capture.detection.model import file_sha256
 from kronc_ns.capture.detection.pifpaf import find_checkpoint
 from kronc_ns.errors import KroncError
-from kronc_ns.files import atomic_path, write_json
-from kronc_ns.keypoints.io import describe_schema
+from kronc_ns.files.keypoints import describe_schema
+from kronc_ns.files.output import atomic_path, write_json
 from kronc_ns.keypoints.schema import KeypointSchema
 
 _SCRIPT = Path(__file__).with_name("isolated") / "export_fields.py"

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from kronc_ns.errors import KroncError
-from kronc_ns.keypoints.io import read_json, read_schema
+from kronc_ns.files.keypoints import read_schema
+from kronc_ns.files.output import read_json
 from kronc_ns.keypoints.schema import KeypointSchema, schema_of_count
 
 EXTRA = "pip install 'kronc-ns[onnx]'"

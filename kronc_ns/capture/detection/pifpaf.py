@@ -12,7 +12,8 @@ from kronc_ns.capture.detection.model import file_sha256
 from kronc_ns.capture.detection.pixels import MAX_LONG_SIDE, is_transparent, read_rgb
 from kronc_ns.capture.images import upright_size
 from kronc_ns.errors import KroncError
-from kronc_ns.keypoints.io import openpifpaf_rows, read_json, read_predictions, read_schema
+from kronc_ns.files.keypoints import openpifpaf_rows, read_predictions, read_schema
+from kronc_ns.files.output import read_json
 from kronc_ns.keypoints.schema import APOLLOCAR3D_24, APOLLOCAR3D_66, KeypointSchema
 
 CHECKPOINT = "shufflenetv2k16-apollo-66"

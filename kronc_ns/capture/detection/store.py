@@ -12,8 +12,8 @@ import numpy as np
 from kronc_ns.capture.detection.detector import CarDetection, CarImage, Detector
 from kronc_ns.capture.detection.model import file_sha256
 from kronc_ns.errors import KroncError
-from kronc_ns.files import cache_folder, write_json
-from kronc_ns.keypoints.io import read_json
+from kronc_ns.files.cache import cache_folder
+from kronc_ns.files.output import read_json, write_json
 
 Progress = Callable[[int, int, None], None]
 

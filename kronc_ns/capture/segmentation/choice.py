@@ -17,8 +17,9 @@ from kronc_ns.capture.detection.pixels import MAX_LONG_SIDE, read_rgb, shrink
 from kronc_ns.capture.segmentation.segmenter import Segmenter
 from kronc_ns.capture.source import Count
 from kronc_ns.errors import KroncError
-from kronc_ns.files import atomic_path, cache_folder
-from kronc_ns.keypoints.select import consistent_path, prominence
+from kronc_ns.files.cache import cache_folder
+from kronc_ns.files.output import atomic_path
+from kronc_ns.keypoints.selection import consistent_path, prominence
 
 SegmenterName: TypeAlias = Literal["maskrcnn", "mask2former", "saliency"]
 

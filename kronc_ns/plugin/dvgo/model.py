@@ -21,7 +21,7 @@ from nerfstudio.utils import colormaps
 from torch import Tensor
 from torch.nn import Parameter
 
-from kronc_ns.console import exit_on_error
+from kronc_ns.commands.console import exit_on_error
 from kronc_ns.errors import KroncError
 from kronc_ns.plugin.checks import check_not_negative, check_positive, check_shares
 from kronc_ns.plugin.dvgo import equations

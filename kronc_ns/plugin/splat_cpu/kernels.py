@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from kronc_ns.compiled import compiled
 from kronc_ns.plugin.splat_cpu.tiles import TILE
+from kronc_ns.solve.compiled import compiled
 
 ALPHA_MIN = np.float32(1 / 255)  # fainter contributions are skipped
 ALPHA_MAX = np.float32(0.999)

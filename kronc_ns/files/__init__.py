@@ -1,0 +1,1 @@
+"""Each format's reader and writer in one module."""

@@ -1,0 +1,49 @@
+"""COLMAP models of solved folders."""
+
+from pathlib import Path
+
+import numpy as np
+
+from kronc_ns.errors import KroncError
+from kronc_ns.files.output import read_json
+from kronc_ns.files.record import solved_points
+from kronc_ns.files.transforms import camera_and_frames, check_file_names, read_poses
+from kronc_ns.geometry.poses import invert
+
+
+def write_colmap(folder: Path, solved: Path) -> int:
+    """Write the COLMAP model (binary) of a solved folder: camera, images with poses, keypoints as 3D points.
+
+    Returns the number of images. Positions, axes and the half-pixel convention are COLMAP's.
+    """
+    import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
+
+    import pycolmap
+
+    transforms = solved / "transforms.json"
+    camera, frames = camera_and_frames(read_json(transforms), transforms)
+    check_file_names([frame["file_path"] for frame in frames], transforms)
+    poses = read_poses(transforms)
+    points = solved_points(solved)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            camera_id=1,
+            model="OPENCV",
+            width=camera.width,
+            height=camera.height,
+            params=[camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
+        )
+    )
+    for number, frame in enumerate(frames, start=1):
+        w2c = invert(poses[frame["file_path"]])
+        image = pycolmap.Image(name=Path(frame["file_path"]).name, camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(w2c))
+    for point in points:
+        model.add_point3D(point, pycolmap.Track(), np.array([200, 40, 40], dtype=np.uint8))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        model.write_binary(str(folder))
+    except (OSError, ValueError) as error:  # ValueError: pycolmap could not open or write a file
+        raise KroncError(f"{folder} cannot be written: {getattr(error, 'strerror', None) or error}") from None
+    return len(frames)

@@ -1,0 +1,179 @@
+"""kronc.json, the evidence beside a solution's transforms.json: a solved folder written, and read back."""
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+import kronc_ns
+from kronc_ns.errors import KroncError
+from kronc_ns.files.keypoints import read_keypoints, write_keypoints
+from kronc_ns.files.output import read_json, relative_path, release_output, write_json
+from kronc_ns.files.ply import write_points
+from kronc_ns.files.provenance import provenance
+from kronc_ns.files.scene_folder import match_keypoints
+from kronc_ns.files.transforms import camera_and_frames, read_poses, transforms_dict
+from kronc_ns.geometry.poses import camera_z
+from kronc_ns.scene import Scene
+from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
+
+KEYPOINT_COLOUR = np.array([200, 40, 40], dtype=np.uint8)
+
+
+def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, inputs: str) -> dict[str, Any]:
+    """Write transforms.json, kronc.json, keypoints.json and the keypoint cloud of a claimed ``folder``; release it.
+
+    ``data`` is the folder that ``scene`` was read from (image paths are written relative to ``folder``);
+    ``inputs`` is the `fingerprint` of what was solved. Returns the content of kronc.json.
+    """
+    names = [relative_path(data, name, folder) for name in solution.names]
+    masks = [relative_path(data, mask, folder) for mask in scene.masks] if scene.masks else None
+    content = transforms_dict(solution.camera, names, solution.c2w, masks)
+    known = solution.points[np.isfinite(solution.points).all(-1)]
+    (folder / "keypoints.ply").unlink(missing_ok=True)
+    if len(known):
+        content["ply_file_path"] = "keypoints.ply"
+        write_points(folder / "keypoints.ply", known, np.tile(KEYPOINT_COLOUR, (len(known), 1)))
+    write_json(folder / "transforms.json", content)
+    if folder.resolve() != data.resolve():  # where they stand already
+        rows = dict(zip(names, scene.keypoints, strict=True))
+        write_keypoints(folder / "keypoints.json", scene.schema, (scene.camera.width, scene.camera.height), rows)
+    report = {
+        **solution_dict(solution),
+        "keypoint_schema": scene.schema.name,
+        "inputs": inputs,
+        "data": relative_path(data, ".", folder),
+        **provenance(),
+    }
+    write_json(folder / "kronc.json", report)
+    release_output(folder)
+    return report
+
+
+def solution_dict(solution: Solution) -> dict[str, Any]:
+    """What kronc.json says about a solution; NaN becomes null."""
+    return {
+        "version": kronc_ns.__version__,
+        "status": solution.status.value,
+        "reason": solution.reason,
+        "solver": solution.solver,
+        "init": solution.init,
+        "iterations": solution.iterations,
+        "seconds": round(solution.seconds, 3),
+        "rmse_px": _number(solution.rmse_px),
+        "median_px": _number(solution.median_px),
+        "focal_px": [solution.camera.fx, solution.camera.fy],
+        "views": [
+            {**{"file_path" if k == "name" else k: v for k, v in asdict(view).items()}, "status": view.status.value}
+            for view in solution.views
+        ],
+        "points": [[_number(x) for x in point] for point in solution.points.tolist()],
+        "history": {key: [_number(x) for x in values] for key, values in solution.history.items()},
+        "initial_c2w": [_rounded(pose) for pose in _flat(solution.initial_c2w)],
+        "path_c2w": [[_rounded(pose) for pose in step] for step in _flat(solution.path)],
+    }
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """kronc.json of a solved ``folder``; raises `KroncError` where there is none or it is broken."""
+    file = folder / "kronc.json"
+    if not file.exists():
+        raise KroncError(f"{file} does not exist: expected a folder solved by `kronc solve` or `ns-process-data kronc`")
+    record = read_json(file)
+    if not isinstance(record, dict):
+        raise KroncError(f"{file}: expected an object, as `kronc solve` writes it: solve again")
+    return record
+
+
+def read_solution(folder: Path) -> tuple[Scene, Solution]:
+    """Scene and solution of a folder that `kronc solve` or `ns-process-data kronc` wrote, failed views included.
+
+    Both ``names`` are paths as seen from ``folder``, those of the view reports as in the scene that was solved. The
+    scene's camera is the solved one, and its keypoints are the detections as the solver took them (left and right put
+    right). Raises `KroncError` naming the file that is missing or broken.
+    """
+    record, file = read_record(folder), folder / "kronc.json"
+    try:
+        names = tuple(relative_path(folder / record["data"], view["file_path"], folder) for view in record["views"])
+        views = tuple(_view(view) for view in record["views"])
+        points = _array(record["points"], (-1, 3))
+        initial = _poses(record["initial_c2w"], len(views))
+        path = np.stack([initial, *(_poses(step, len(views)) for step in record.get("path_c2w", []))])[1:]
+        history = {key: [float(value) for value in values] for key, values in record["history"].items()}
+        overall: dict[str, Any] = {key: record[key] for key in ("reason", "solver", "init", "iterations", "seconds")}
+        for key in ("rmse_px", "median_px"):
+            overall[key] = math.nan if record[key] is None else float(record[key])
+        status = Status(record["status"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise KroncError(f"{file} is not as `kronc solve` writes it ({error!r}): solve again") from None
+
+    transforms = folder / "transforms.json"
+    # of failed views transforms.json says nothing
+    camera, _ = camera_and_frames({**read_json(transforms), "frames": record["views"]}, transforms)
+    poses = read_poses(transforms)
+    c2w = np.stack([poses.get(name, np.full((3, 4), np.nan)) for name in names])
+    found = read_keypoints(folder / "keypoints.json")
+    if len(points) != len(found.schema):
+        raise KroncError(f"{file} has {len(points)} points, keypoints.json {len(found.schema)}: solve again")
+    keypoints = match_keypoints(found, names, camera)[0]
+    swapped = np.array([view.swapped for view in views])
+    keypoints = np.where(swapped[:, None, None], found.schema.mirrored(keypoints), keypoints)
+    solved = np.array([view.status is ViewStatus.SOLVED for view in views])
+    depths = camera_z(c2w, points)
+    solution = Solution(
+        status=status,
+        names=names,
+        camera=camera,
+        c2w=c2w,
+        points=points,
+        depths=np.where((keypoints[..., 2] > 0) & solved[:, None], depths, math.nan),
+        views=views,
+        initial_c2w=initial,
+        history=history,
+        path=path,
+        **overall,
+    )
+    return Scene(names, camera, found.schema, keypoints), solution
+
+
+def _view(view: dict[str, Any]) -> ViewReport:
+    evidence = {key: value for key, value in view.items() if key != "file_path"}
+    return ViewReport(**{**evidence, "name": view["file_path"], "status": ViewStatus(view["status"])})
+
+
+def _poses(poses: list[list[float] | None], count: int) -> Float[np.ndarray, "n 3 4"]:
+    """Rows of twelve numbers, null where there is no pose."""
+    return _array([pose or [None] * 12 for pose in poses], (count, 3, 4))
+
+
+def _array(values: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """Nested lists as float64, null as NaN."""
+    return np.array(values, dtype=np.float64).reshape(shape)
+
+
+def _flat(poses: Float[np.ndarray, "*n 3 4"] | None) -> list[Any]:
+    """Twelve numbers a pose, row by row."""
+    return [] if poses is None else poses.reshape(*poses.shape[:-2], 12).tolist()
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _rounded(pose: list[float]) -> list[float] | None:
+    """The twelve numbers of a pose, row by row, as exact as a picture needs them; None where there is none."""
+    return [round(x, 5) for x in pose] if all(map(math.isfinite, pose)) else None
+
+
+def solved_points(solved: Path) -> Float[np.ndarray, "j 3"]:
+    """The keypoints of a solved folder that have a place."""
+    try:
+        points = [point for point in read_record(solved)["points"] if None not in point]
+        return np.array(points, dtype=np.float64).reshape(-1, 3)
+    except (KeyError, TypeError, ValueError):
+        raise KroncError(
+            f'{solved / "kronc.json"}: expected "points", as `kronc solve` writes them: solve again'
+        ) from None

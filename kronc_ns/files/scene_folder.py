@@ -1,0 +1,147 @@
+"""Scene folders: images, transforms.json, keypoints.json, masks and depth maps become a `Scene`, checked."""
+
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from kronc_ns.errors import KroncError
+from kronc_ns.files.images import depth_under, read_depth, read_grey
+from kronc_ns.files.keypoints import Detections, read_keypoints
+from kronc_ns.files.output import read_json
+from kronc_ns.files.transforms import camera_and_frames, given_poses
+from kronc_ns.geometry.camera import Camera
+from kronc_ns.keypoints.selection import select_instances
+from kronc_ns.scene import Scene
+
+_UNDONE_PX, _FEW = 0.5, 0.05
+
+
+def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
+    """Read a scene folder: ``transforms.json`` (intrinsics, frames) and ``keypoints.json`` (or ``keypoints``).
+
+    Raises `KroncError` naming the file and the remedy for anything that is missing, malformed or inconsistent.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise KroncError(f"{folder} is no folder: expected a scene folder with transforms.json and keypoints.json")
+    file = folder / "transforms.json"
+    if not file.exists():
+        raise KroncError(
+            f"{file} does not exist: a scene folder needs it for the intrinsics; "
+            "`ns-process-data kronc` makes one from photos or a video"
+        )
+    content = read_json(file)
+    camera, frames = camera_and_frames(content, file)
+    names = tuple(str(frame["file_path"]) for frame in frames)
+    _check_images(folder, names)
+    masks = tuple(str(frame.get("mask_path", "")) for frame in frames)
+    if any(masks) and not all(masks):
+        raise KroncError(f"{file}: frame {names[masks.index('')]} lacks a mask_path that others have: give all or none")
+    is_solution = (folder / "kronc.json").exists()
+    found = read_keypoints(keypoints or folder)
+    if is_solution:
+        found = _without(found, left_out_views(folder))
+    rows, note = match_keypoints(found, names, camera, [folder / m for m in masks] if all(masks) and masks else None)
+    _check_distortion(camera, rows, file)
+    return Scene(
+        names=names,
+        camera=camera,
+        schema=found.schema,
+        keypoints=rows,
+        given_c2w=None if is_solution else given_poses(frames, file),
+        given_depths=_given_depths(folder, frames, rows, camera),
+        masks=masks if any(masks) else None,
+        notes=(note,) if note else (),
+    )
+
+
+def match_keypoints(
+    found: Detections, names: tuple[str, ...], camera: Camera, masks: list[Path] | None = None
+) -> tuple[Float[np.ndarray, "n j 3"], str]:
+    """Rows for each view from a keypoint file, matched by path or else by file name; and a note on choices made."""
+    if found.size is not None and found.size != (camera.width, camera.height):
+        raise KroncError(
+            f"{found.source} is for {found.size[0]}x{found.size[1]} images, the camera says "
+            f"{camera.width}x{camera.height}: expected keypoints in the pixels of the images"
+        )
+    by_name: dict[str, str] = {}
+    for name in names:
+        by_name[PurePosixPath(name).name] = "" if PurePosixPath(name).name in by_name else name
+    matched: dict[str, np.ndarray] = {}
+    unknown = []
+    for key, instances in found.frames.items():
+        name = key if key in names else by_name.get(PurePosixPath(key).name, "")
+        if name:
+            matched[name] = instances
+        else:
+            unknown.append(key)
+    if unknown:
+        raise KroncError(
+            f"{found.source} has keypoints for {len(unknown)} images that do not exist ({unknown[0]}): "
+            f"expected names like {names[0]}"
+        )
+    empty = np.zeros((0, len(found.schema), 3))
+    instances = [matched.get(name, empty) for name in names]
+    if not any((rows[..., 2] > 0).any() for rows in instances):
+        raise KroncError(
+            f"{found.source}: no keypoints for any of the {len(names)} images: expected at least 4 in 3 views"
+        )
+    several = [i for i, rows in enumerate(instances) if len(rows) > 1]
+    read = [read_grey(path) if i in several else None for i, path in enumerate(masks)] if masks and several else None
+    rows, note = select_instances(instances, (camera.width, camera.height), read)
+    return rows, note if several else ""
+
+
+def left_out_views(folder: Path) -> set[str]:
+    """File names of the views that a solved folder's transforms.json no longer lists because they failed."""
+    file = folder / "kronc.json"
+    try:
+        views = read_json(file)["views"]
+        return {PurePosixPath(view["file_path"]).name for view in views if view["status"] == "failed"}
+    except (KeyError, TypeError):
+        raise KroncError(f'{file}: expected "views", as `kronc solve` writes them: solve again') from None
+
+
+def _without(found: Detections, file_names: set[str]) -> Detections:
+    kept = {key: rows for key, rows in found.frames.items() if PurePosixPath(key).name not in file_names}
+    return replace(found, frames=kept)
+
+
+def _check_distortion(camera: Camera, keypoints: Float[np.ndarray, "n j 3"], file: Path) -> None:
+    """Distortion can be undone where keypoints are, but for a few in the corners."""
+    uv = keypoints[..., :2]
+    inside = (keypoints[..., 2] > 0) & (uv >= 0).all(-1) & (uv[..., 0] <= camera.width) & (uv[..., 1] <= camera.height)
+    if not any(camera.distortion) or not inside.any():
+        return
+    off = np.linalg.norm(camera.distort(camera.undistort(uv[inside])) - uv[inside], axis=-1)
+    lost = float((~(off < _UNDONE_PX)).mean())
+    if lost > _FEW:
+        raise KroncError(
+            f"{file}: distortion (k1, k2, p1, p2) = {camera.distortion} cannot be undone for {100 * lost:.0f} % of the "
+            "keypoints: expected OpenCV's coefficients of this camera, or none"
+        )
+
+
+def _check_images(folder: Path, names: tuple[str, ...]) -> None:
+    """Every listed image exists, unless the scene has keypoints only (no image folder at all)."""
+    if not any((folder / name).parent.is_dir() and any((folder / name).parent.iterdir()) for name in names[:1]):
+        return
+    missing = [name for name in names if not (folder / name).exists()]
+    if missing:
+        raise KroncError(f"{folder / missing[0]} does not exist ({len(missing)} images of transforms.json are missing)")
+
+
+def _given_depths(
+    folder: Path, frames: list[dict[str, Any]], rows: Float[np.ndarray, "n j 3"], camera: Camera
+) -> Float[np.ndarray, "n j"] | None:
+    """Depth maps (nerfstudio's 16-bit millimetres, or .npy in metres) read under the keypoints."""
+    if not all(frame.get("depth_file_path") for frame in frames):
+        return None
+    depths = [
+        depth_under(row, read_depth(folder / str(frame["depth_file_path"])), camera)
+        for frame, row in zip(frames, rows, strict=True)
+    ]
+    return np.stack(depths)

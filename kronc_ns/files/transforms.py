@@ -1,0 +1,132 @@
+"""nerfstudio's transforms.json: the shared camera and the frames, read and written (OpenGL axes in the file)."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from kronc_ns.errors import KroncError
+from kronc_ns.files.output import read_json
+from kronc_ns.geometry.camera import Camera
+from kronc_ns.geometry.poses import flip_camera_axes
+
+_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
+
+
+def transforms_dict(
+    camera: Camera,
+    names: Sequence[str],
+    c2w: Float[np.ndarray, "n 3 4"] | None,
+    masks: Sequence[str] | None = None,
+    depths: Sequence[str] | None = None,
+) -> dict[str, Any]:
+    """nerfstudio's transforms.json (OpenGL axes) as a dictionary; views with NaN poses are left out."""
+    content: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+        "k1": camera.k1,
+        "k2": camera.k2,
+        "p1": camera.p1,
+        "p2": camera.p2,
+    }
+    frames = []
+    opengl = None if c2w is None else flip_camera_axes(c2w)
+    for i, name in enumerate(names):
+        frame: dict[str, Any] = {"file_path": name}
+        if masks is not None:
+            frame["mask_path"] = masks[i]
+        if depths is not None:
+            frame["depth_file_path"] = depths[i]
+        if opengl is not None:
+            if not np.isfinite(opengl[i]).all():
+                continue
+            frame["transform_matrix"] = [*opengl[i].tolist(), [0.0, 0.0, 0.0, 1.0]]
+        frames.append(frame)
+    content["frames"] = frames
+    return content
+
+
+def camera_and_frames(content: Any, file: Path) -> tuple[Camera, list[dict[str, Any]]]:
+    """The shared camera and the frames of a nerfstudio transforms file."""
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):
+        raise KroncError(f'{file}: expected "frames", a list of objects with "file_path", as nerfstudio writes it')
+    if not frames:
+        raise KroncError(f"{file}: no frames: expected at least 3 views")
+    twice = [name for name, count in Counter(str(f["file_path"]) for f in frames).items() if count > 1]
+    if twice:
+        raise KroncError(f"{file}: {twice[0]} is listed twice: expected one frame per image")
+    if content.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+        raise KroncError(
+            f"{file}: camera_model {content['camera_model']!r} is not supported: expected OPENCV or PINHOLE"
+        )
+    cameras = set()
+    for frame in frames:
+        merged = {key: frame.get(key, content.get(key)) for key in _INTRINSICS}
+        merged["fl_y"] = merged["fl_x"] if merged["fl_y"] is None else merged["fl_y"]
+        missing = [key for key in _INTRINSICS[:6] if merged[key] is None]
+        if missing:
+            raise KroncError(f"{file}: {', '.join(missing)} missing: expected the intrinsics at the top level")
+        try:
+            numbers = [float(0.0 if merged[key] is None else merged[key]) for key in _INTRINSICS]
+            width, height = map(int, numbers[4:6])
+        except (TypeError, ValueError, OverflowError):
+            raise KroncError(f"{file}: intrinsics {merged} are not all finite numbers") from None
+        fx, fy, cx, cy = numbers[:4]
+        cameras.add(Camera(fx, fy, cx, cy, width, height, *numbers[6:]))
+    if len(cameras) > 1:
+        sizes = sorted({(c.width, c.height) for c in cameras})
+        what = f"images of different sizes {sizes}" if len(sizes) > 1 else "frames with different intrinsics"
+        raise KroncError(f"{file}: {what}: expected one camera and one size for all views")
+    return cameras.pop(), frames
+
+
+def read_poses(file: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
+    """Camera-to-world poses (OpenCV axes) by ``file_path``, of the frames that have one, from a transforms file."""
+    content = read_json(file)
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):
+        raise KroncError(f'{file}: expected "frames", a list of objects with "file_path", as nerfstudio writes it')
+    posed = [frame for frame in frames if frame.get("transform_matrix") is not None]
+    return {str(frame["file_path"]): _pose(frame, file) for frame in posed}
+
+
+def given_poses(frames: list[dict[str, Any]], file: Path) -> Float[np.ndarray, "n 3 4"] | None:
+    """Poses (OpenCV c2w) of all frames; None unless every frame has one."""
+    if not all(frame.get("transform_matrix") is not None for frame in frames):
+        return None
+    return np.stack([_pose(frame, file) for frame in frames])
+
+
+def _pose(frame: dict[str, Any], file: Path) -> Float[np.ndarray, "3 4"]:
+    where = f"{file}, {frame['file_path']}"
+    try:
+        matrix = np.asarray(frame["transform_matrix"], dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise KroncError(f"{where}: transform_matrix must be 4x4 finite numbers (camera to world)")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise KroncError(f"{where}: transform_matrix holds no rotation: expected an orthonormal, right-handed 3x3 part")
+    u, _, vh = np.linalg.svd(rotation)
+    clean = np.concatenate([u @ vh, matrix[:3, 3:]], axis=1)
+    return flip_camera_axes(clean)
+
+
+def check_file_names(names: Sequence[str], file: Path) -> None:
+    """Raise `KroncError` where folders alone tell images apart, for what knows them by file name."""
+    (name, count), *_ = Counter(PurePosixPath(name).name for name in names).most_common(1)
+    if count > 1:
+        raise KroncError(
+            f"{file}: {count} images in different folders are called {name}: here views are told apart by file name, "
+            "give each its own"
+        )

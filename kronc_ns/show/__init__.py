@@ -1,0 +1,1 @@
+"""What a solution looks like: the report, the viewer."""

@@ -1,0 +1,127 @@
+import json
+
+import numpy as np
+import pytest
+
+from kronc_ns.errors import KroncError
+from kronc_ns.files.keypoints import read_keypoints, write_keypoints
+from kronc_ns.keypoints.schema import APOLLOCAR3D_24, APOLLOCAR3D_66, KeypointSchema
+
+
+def rows(seed: int, n: int = 66) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    uvc = np.concatenate([rng.uniform(0, 400, (n, 2)).round(2), rng.uniform(0.1, 1, (n, 1)).round(3)], axis=1)
+    uvc[rng.uniform(size=n) < 0.4] = 0
+    return uvc
+
+
+def test_own_format_round_trip(tmp_path):
+    frames = {"images/a.png": rows(0), "images/b.png": rows(1)}
+    write_keypoints(tmp_path / "keypoints.json", APOLLOCAR3D_66, (480, 270), frames)
+    read = read_keypoints(tmp_path / "keypoints.json")
+    assert read.schema is APOLLOCAR3D_66
+    assert read.size == (480, 270)
+    for name, expected in frames.items():
+        np.testing.assert_allclose(read.frames[name][0], expected)
+
+
+def test_own_schema_round_trip(tmp_path):
+    schema = KeypointSchema("chair", ("a", "b", "c", "d", "e"), (1, 0, 2, 4, 3))
+    write_keypoints(tmp_path / "k.json", schema, (10, 10), {"x.png": rows(2, 5)})
+    assert read_keypoints(tmp_path / "k.json").schema == schema
+
+
+def test_openpifpaf_folder(tmp_path):
+    uvc = rows(3)
+    instance = {"keypoints": uvc.flatten().tolist(), "bbox": [0, 0, 1, 1], "score": 0.9, "category_id": 1}
+    (tmp_path / "frame_00001.png.predictions.json").write_text(json.dumps([instance, instance]))
+    (tmp_path / "frame_00002.png.predictions.json").write_text("[]")
+    read = read_keypoints(tmp_path)
+    assert set(read.frames) == {"frame_00001.png", "frame_00002.png"}
+    assert read.frames["frame_00001.png"].shape == (2, 66, 3)
+    assert read.frames["frame_00002.png"].shape == (0, 66, 3)
+    seen = uvc[:, 2] > 0
+    np.testing.assert_allclose(read.frames["frame_00001.png"][0][seen, :2], uvc[seen, :2] + 0.5)  # pixel centres
+    assert (read.frames["frame_00001.png"][0][~seen] == 0).all()
+
+
+def test_openpifpaf_files_of_the_24_point_model(tmp_path):
+    uvc = rows(4, 24)
+    (tmp_path / "a.png.predictions.json").write_text("[]")
+    (tmp_path / "b.png.predictions.json").write_text(json.dumps([{"keypoints": uvc.flatten().tolist()}]))
+    read = read_keypoints(tmp_path)
+    assert read.schema is APOLLOCAR3D_24
+    assert {name: found.shape for name, found in read.frames.items()} == {"a.png": (0, 24, 3), "b.png": (1, 24, 3)}
+
+
+def test_a_known_schema_is_written_by_name(tmp_path):
+    write_keypoints(tmp_path / "k.json", APOLLOCAR3D_24, (10, 10), {"x.png": rows(2, 24)})
+    assert json.loads((tmp_path / "k.json").read_text())["schema"] == "apollocar3d-24"
+    assert read_keypoints(tmp_path / "k.json").schema is APOLLOCAR3D_24
+
+
+def coco(labels, values) -> dict:
+    return {
+        "images": [{"id": 5, "file_name": "a.png", "width": 40, "height": 30}, {"id": 6, "file_name": "b.png"}],
+        "categories": [{"id": 1, "name": "thing", "keypoints": ["p", "q", "r", "s"]}],
+        "annotations": [
+            {
+                "image_id": 5,
+                "category_id": 1,
+                "keypoints": [c for v, seen in zip(values, labels, strict=True) for c in (*v, seen)],
+            }
+        ],
+    }
+
+
+def test_coco_annotations(tmp_path):
+    content = coco([2, 1, 0, 2], [(1, 2), (3, 4), (0, 0), (5, 6)])
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    read = read_keypoints(tmp_path / "coco.json")
+    expected = [[1.5, 2.5, 1.0], [3.5, 4.5, 0.5], [0, 0, 0], [5.5, 6.5, 1.0]]
+    np.testing.assert_allclose(read.frames["a.png"][0], expected)
+    assert read.frames["b.png"].shape == (0, 4, 3)
+    assert read.size == (40, 30)
+
+
+def test_coco_scores_of_a_detector_are_kept(tmp_path):
+    (tmp_path / "coco.json").write_text(json.dumps(coco([0.9, 0.4, 0, 1.0], [(1, 2), (3, 4), (0, 0), (5, 6)])))
+    np.testing.assert_allclose(read_keypoints(tmp_path / "coco.json").frames["a.png"][0, :, 2], [0.9, 0.4, 0, 1.0])
+
+
+def own(frames) -> str:
+    return json.dumps({"schema": "apollocar3d-66", "width": 480, "height": 270, "frames": frames})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "no keypoint file"),
+        (own([{"file_path": "a.png", "keypoints": [[1, 2, 1]] * 65}]), "65 keypoints, expected 66"),
+        (own([{"file_path": "a.png", "keypoints": [[1, 2, 1]] * 65 + [[float("nan"), 2, 1]]}]), "not finite"),
+        (own([{"file_path": "a.png", "keypoints": [[1, 2, 1]] * 65 + [[1, 2, float("nan")]]}]), "not finite"),
+        (own([{"file_path": "a.png", "keypoints": [[1, 2, -1]] * 66}]), "negative"),
+        (own([{"file_path": "a.png", "keypoints": "none"}]), "not numbers"),
+        (own([{"file_path": "a.png", "keypoints": [[0, 0, 0]] * 66}] * 2), "two frames are called a.png"),
+        (own([{"keypoints": []}]), "lacks"),
+        ('{"schema": "dogs", "frames": []}', "schema 'dogs' is unknown"),
+    ],
+)
+def test_bad_files_get_a_clear_error(tmp_path, text, message):
+    path = tmp_path / "keypoints.json"
+    path.write_text(text)
+    with pytest.raises(KroncError, match=message) as caught:
+        read_keypoints(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_and_empty_places_name_the_formats(tmp_path):
+    for path in (tmp_path, tmp_path / "nothing.json"):
+        with pytest.raises(KroncError, match="OpenPifPaf"):
+            read_keypoints(path)
+
+
+def test_nan_of_an_unseen_point_is_ignored(tmp_path):
+    (tmp_path / "k.json").write_text(own([{"file_path": "a.png", "keypoints": [[float("nan"), 2, 0]] * 66}]))
+    assert (read_keypoints(tmp_path / "k.json").frames["a.png"] == 0).all()
