@@ -1,62 +1,54 @@
-"""Scenes to the second-order solver and back.
-
-Scenes that are handed in together are solved in batches; what happens to one does not depend on the others.
-"""
+"""Hypotheses to the second-order solver and back."""
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import torch
+import numpy as np
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
 
 from kronc_ns.fit.options import KroncConfig
-from kronc_ns.fit.starts import MIN_POINTS, Start, far_side, in_front, usable_views
+from kronc_ns.fit.starts import MIN_POINTS, Hypothesis, usable_views
 from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.template import car_template
-from kronc_ns.solve import objective
-from kronc_ns.solve.lm import RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX, TRIM_SIGMAS, LmResult, adjust
-from kronc_ns.solve.problem import Problem, ShapePrior, State
-from kronc_ns.solve.uncertainty import camera_covariance
+from kronc_ns.solve.covariance import camera_covariance
+from kronc_ns.solve.lm import LmResult, adjust
+from kronc_ns.solve.problem import Intrinsic, Problem, ShapePrior, State
+from kronc_ns.solve.robust import INLIER_SIGMAS, noise_px
 
 _NO_CHANCE = 8  # a pose can be bent to meet three detections; eight do not agree by accident
-_PADDING = 8  # views are padded to a multiple, so that scenes of similar size share a batch
-_BATCH_VIEWS = 400  # views in a batch: what stays in the processor's cache
 _STEPS_KEPT = 20  # of the poses on the way: enough to watch them move
 _REFINEMENTS = 3  # more rounds of undistortion with the k1 found
+_TOLERATED = 0.01  # of the image diagonal: what a detection may be off to count as met by half
 
 
 @dataclass(frozen=True)
 class Attempt:
     """What the solver made of a start."""
 
-    start: Start
-    """With the poses, points and camera found."""
-    initial_c2w: Float[Tensor, "n 3 4"]
-    """Where it began, in the frame of the initialiser."""
-    inlier: Bool[Tensor, "n j"]
+    start: Hypothesis
+    found: Hypothesis
+    inlier: Bool[np.ndarray, "n j"]
     sigma_px: float
     shape_weight: float
     """1 for a usual car, towards 0 the less it looks like one."""
-    covariance: Float[Tensor, "n 6 6"]
+    covariance: Float[np.ndarray, "n 6 6"]
     iterations: int
     converged: bool
     history: dict[str, list[float]]
-    path: Float[Tensor, "s n 3 4"]
+    path: Float[np.ndarray, "s n 3 4"]
     """Poses at steps on the way, in the gauge of the solver."""
     choice: str = ""
     """Why this start was preferred to others."""
 
     @property
-    def agreeing(self) -> Bool[Tensor, "n"]:
+    def agreeing(self) -> Bool[np.ndarray, "n"]:
         """Views that `agrees` with the solved points."""
-        return agrees(self.inlier.sum(1), (self.start.scene.visibility > 0).sum(1))
+        return agrees(self.inlier.sum(1), self.found.scene.seen.sum(1))
 
 
-def agrees(inliers: Int[Tensor, "n"], seen: Int[Tensor, "n"]) -> Bool[Tensor, "n"]:
+def agrees(inliers: Int[np.ndarray, "n"], seen: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
     """Whether views fit the solved points: half of their detections do, or so many that it cannot be chance."""
     return (inliers >= MIN_POINTS) & (2 * inliers >= seen) | (inliers >= _NO_CHANCE) & (4 * inliers >= seen)
 
@@ -69,125 +61,102 @@ def shape_prior(schema: KeypointSchema) -> ShapePrior | None:
 
 
 def adjust_starts(
-    starts: Sequence[Start], config: KroncConfig, progress: Callable[[int, float], None] | None = None
+    starts: Sequence[Hypothesis], config: KroncConfig, progress: Callable[[int, float], None] | None = None
 ) -> list[Attempt]:
     """Run the solver from every start."""
-    attempts: list[Attempt | None] = [None] * len(starts)
-    groups: dict[tuple[int, KeypointSchema], list[int]] = defaultdict(list)
-    for i, start in enumerate(starts):
-        padded = -(-len(start.scene) // _PADDING) * _PADDING
-        groups[padded, start.scene.schema].append(i)
-    for (views, _), members in groups.items():
-        size = max(1, _BATCH_VIEWS // views)
-        for first in range(0, len(members), size):
-            chosen = members[first : first + size]
-            for i, attempt in zip(chosen, _run([starts[i] for i in chosen], views, config, progress), strict=True):
-                attempts[i] = attempt
-    return [attempt for attempt in attempts if attempt is not None]
+    refine: tuple[Intrinsic, ...] = (
+        *(("focal",) if config.refine_focal else ()),
+        *(("k1",) if config.refine_k1 else ()),
+    )
+    if config.device == "cuda":
+        from kronc_ns.solve.batched import adjust_batch  # seconds of torch's import
+
+        def solve(found: Sequence[Hypothesis]) -> list[tuple[Problem, LmResult]]:
+            problems = [problem_of(one, refine) for one in found]
+            states = [State.of(_posed(one), one.points) for one in found]
+            results = adjust_batch(problems, states, config.lm, "cuda", progress)
+            return list(zip(problems, results, strict=True))
+    else:
+
+        def solve(found: Sequence[Hypothesis]) -> list[tuple[Problem, LmResult]]:
+            problems = [problem_of(one, refine) for one in found]
+            return [
+                (problem, adjust(problem, State.of(_posed(one), one.points), config.lm, progress))
+                for problem, one in zip(problems, found, strict=True)
+            ]
+
+    found = list(starts)
+    solved: list[tuple[Problem, LmResult]] = []
+    for _ in range(1 + (_REFINEMENTS if config.refine_k1 else 0)):
+        solved = solve(found)
+        found = [_moved(one, result) for one, (_, result) in zip(found, solved, strict=True)]
+    return [_attempt(*row) for row in zip(starts, found, *zip(*solved, strict=True), strict=True)] if solved else []
 
 
-def _run(
-    starts: list[Start], views: int, config: KroncConfig, progress: Callable[[int, float], None] | None
-) -> list[Attempt]:
-    device = torch.device("cuda" if config.device == "cuda" else "cpu")
-    refine = (*(("focal",) if config.refine_focal else ()), *(("k1",) if config.refine_k1 else ()))
-    began = starts
-
-    def solve() -> tuple[Problem, LmResult]:
-        problem, state = _problem(starts, views, refine, shape_prior(starts[0].scene.schema))
-        problem = problem.to(device)
-        return problem, adjust(problem, state.each(lambda t: t.to(device)), config.lm, progress)
-
-    problem, result = solve()
-    starts = [_moved(start, result, i, refine) for i, start in enumerate(starts)]
-    for _ in range(_REFINEMENTS if config.refine_k1 else 0):
-        problem, result = solve()
-        starts = [_moved(start, result, i, refine) for i, start in enumerate(starts)]
-    inlier = result.inlier
-    covariance = camera_covariance(problem, result.state, inlier, result.sigma_px, result.shape_weight)
-    inlier, covariance = inlier.cpu(), covariance.cpu()
-    sigma, weight = result.sigma_px.tolist(), result.shape_weight.tolist()
-    iterations, converged = result.iterations.tolist(), result.converged.tolist()
-    return [
-        Attempt(
-            start,
-            first.c2w,
-            inlier[i, : len(start.scene)],
-            sigma[i],
-            weight[i],
-            covariance[i, : len(start.scene)],
-            iterations[i],
-            converged[i],
-            result.history(i),
-            on_the_way(result.path(i)[:, : len(start.scene)], start.used),
-        )
-        for i, (start, first) in enumerate(zip(starts, began, strict=True))
-    ]
+def _attempt(start: Hypothesis, found: Hypothesis, problem: Problem, result: LmResult) -> Attempt:
+    steps = [result.path[i].c2w for i in kept_steps(len(result.path))]
+    path = np.stack(steps) if steps else np.empty((0, len(start.scene), 3, 4))
+    return Attempt(
+        start=start,
+        found=found,
+        inlier=result.inlier,
+        sigma_px=result.sigma_px,
+        shape_weight=result.shape_weight,
+        covariance=camera_covariance(problem, result.state, result.inlier, result.sigma_px, result.shape_weight),
+        iterations=len(result.loss),
+        converged=result.converged,
+        history={"step": [float(step) for step in range(1, len(result.loss) + 1)], "loss": list(result.loss)},
+        path=np.where(start.used[:, None, None], path, math.nan),
+    )
 
 
-def on_the_way(path: Float[Tensor, "s n 3 4"], used: Bool[Tensor, "n"]) -> Float[Tensor, "k n 3 4"]:
-    """A few of the steps, evenly spread; NaN for views that take no part."""
-    chosen = torch.linspace(0, len(path) - 1, min(len(path), _STEPS_KEPT)).round().long()
-    return torch.where(used[:, None, None], path[chosen].double().cpu(), math.nan)
+def kept_steps(count: int) -> list[int]:
+    """A few of the steps on the way, evenly spread."""
+    return np.round(np.linspace(0, count - 1, min(count, _STEPS_KEPT))).astype(int).tolist()
 
 
-def _problem(starts: list[Start], views: int, refine: tuple, prior: ShapePrior | None) -> tuple[Problem, State]:
-    """The batch of all starts, views padded by unseen ones."""
-    joints = len(starts[0].scene.schema)
-    uv = torch.zeros(len(starts), views, 2, joints, dtype=torch.float64)
-    weight = torch.zeros(len(starts), views, joints, dtype=torch.float64)
-    c2w = torch.eye(3, 4, dtype=torch.float64).repeat(len(starts), views, 1, 1)
-    for i, start in enumerate(starts):
-        scene, n = start.scene, len(start.scene)
-        principal = torch.tensor([scene.camera.cx, scene.camera.cy], dtype=torch.float64)
-        uv[i, :n] = (scene.uv - principal).transpose(1, 2)
-        m = scene.visibility * start.used[:, None]
-        if prior is None:
-            m = m * (m.sum(0) >= 2)  # without a prior a single view says nothing of a point
-        confidence = scene.keypoints[..., 2]
-        weight[i, :n] = m * confidence / (m * confidence).sum().clamp_min(1e-9) * m.sum()
-        c2w[i, :n] = torch.where(start.used[:, None, None], start.c2w, c2w[i, :n])
-    focal = torch.tensor([[s.scene.camera.fx, s.scene.camera.fy] for s in starts], dtype=torch.float64)
-    points = torch.stack([start.points for start in starts])
-    return Problem(uv, weight, focal, prior, refine=refine), State.of(c2w, points, len(refine))
+def _posed(found: Hypothesis) -> Float[np.ndarray, "n 3 4"]:
+    """Poses, of views that take no part any."""
+    return np.where(found.used[:, None, None], found.c2w, np.eye(3, 4))
 
 
-def _moved(start: Start, result: LmResult, i: int, refine: tuple) -> Start:
+def problem_of(found: Hypothesis, refine: tuple[Intrinsic, ...] = (), with_prior: bool = True) -> Problem:
+    """What the views that take part measured."""
+    scene, camera = found.scene, found.scene.camera
+    prior = shape_prior(scene.schema) if with_prior else None
+    m = scene.visibility * found.used[:, None]
+    if prior is None:
+        m = m * (m.sum(0) >= 2)  # without a prior a single view says nothing of a point
+    confident = m * scene.keypoints[..., 2]
+    weight = confident / max(confident.sum(), 1e-9) * m.sum()
+    return Problem(scene.uv - (camera.cx, camera.cy), weight, (camera.fx, camera.fy), prior, refine=refine)
+
+
+def _moved(start: Hypothesis, result: LmResult) -> Hypothesis:
     """The start where the solver has left it, its camera included."""
-    n = len(start.scene)
-    c2w = torch.where(start.used[:, None, None], result.state.c2w[i, :n].cpu(), start.c2w)
-    scene = start.scene
-    if refine:
-        change = dict(zip(refine, result.state.intrinsics[i].tolist(), strict=True))
-        growth = math.exp(change.get("focal", 0.0))
-        old = scene.camera
-        camera = replace(old, fx=old.fx * growth, fy=old.fy * growth, k1=old.k1 + change.get("k1", 0.0))
-        scene = replace(scene, camera=camera)
-    return replace(start, scene=scene, c2w=c2w, points=result.state.points[i].cpu())
+    state, scene, old = result.state, start.scene, start.scene.camera
+    if state.log_growth or state.k1:
+        growth = math.exp(state.log_growth)
+        scene = replace(scene, camera=replace(old, fx=old.fx * growth, fy=old.fy * growth, k1=old.k1 + state.k1))
+    c2w = np.where(start.used[:, None, None], state.c2w, start.c2w)
+    return replace(start, scene=scene, c2w=c2w, points=state.points)
 
 
 def measured(
-    start: Start,
-    initial_c2w: Float[Tensor, "n 3 4"],
-    iterations: int,
-    history: dict[str, list[float]],
-    path: Float[Tensor, "s n 3 4"],
+    start: Hypothesis, found: Hypothesis, iterations: int, history: dict[str, list[float]], path: np.ndarray
 ) -> Attempt:
     """An attempt of another solver, with inliers and covariance as this one's have them."""
-    scene = start.scene
-    seen = (scene.visibility > 0) & start.used[:, None] & start.points.isfinite().all(-1)
-    error = (objective.reproject(start.points, start.c2w, scene.camera) - scene.uv).norm(dim=-1)
-    error = torch.where(seen & in_front(start), error, math.inf)
-    finite = error[error.isfinite()]
-    sigma_px = max(float(finite.median()) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX) if len(finite) else math.nan
-    inlier = error <= TRIM_SIGMAS * sigma_px
-    covariance = torch.full((len(scene), 6, 6), math.nan, dtype=torch.float64)
+    scene = found.scene
+    counted = scene.seen & found.used[:, None]
+    error = np.where(counted, found.error_px, math.inf)
+    sigma_px = noise_px(error[np.isfinite(error)])
+    inlier = error <= INLIER_SIGMAS * sigma_px
+    covariance = np.full((len(scene), 6, 6), math.nan)
     if inlier.any():
-        known = replace(start, points=start.points.nan_to_num(0.0))
-        problem, state = _problem([known], len(scene), (), None)
-        one = torch.ones(1, dtype=torch.float64)
-        covariance = camera_covariance(problem, state, inlier[None], one * sigma_px, one)[0]
-    return Attempt(start, initial_c2w, inlier, sigma_px, 1.0, covariance, iterations, True, history, path)
+        points = np.where(np.isfinite(found.points), found.points, 0.0)
+        problem = problem_of(found, with_prior=False)
+        covariance = camera_covariance(problem, State.of(_posed(found), points), inlier, sigma_px, 1.0)
+    return Attempt(start, found, inlier, sigma_px, 1.0, covariance, iterations, True, history, path)
 
 
 def misfit(attempt: Attempt) -> float:
@@ -195,11 +164,11 @@ def misfit(attempt: Attempt) -> float:
 
     Comparable between attempts at the same scene; detections behind a camera or on the car's far side count as lost.
     """
-    start = attempt.start
-    scene = start.scene
-    tolerance = 0.01 * math.hypot(scene.camera.width, scene.camera.height)
-    counted = (scene.visibility > 0) & usable_views(scene)[:, None]
-    error = (objective.reproject(start.points, start.c2w, scene.camera) - scene.uv).norm(dim=-1)
-    off = (1 - 1 / (1 + (error / tolerance).square())).nan_to_num(1.0)
-    lost = ~in_front(start) | far_side(start) | ~start.used[:, None]
-    return float(torch.where(lost, 1.0, off)[counted].mean()) if counted.any() else 1.0
+    found = attempt.found
+    scene = found.scene
+    counted = scene.seen & usable_views(scene)[:, None]
+    if not counted.any():
+        return 1.0
+    tolerance = _TOLERATED * math.hypot(scene.camera.width, scene.camera.height)
+    off = 1 - 1 / (1 + (found.error_px / tolerance) ** 2)
+    return float(np.where(found.far_side | ~found.used[:, None], 1.0, off)[counted].mean())

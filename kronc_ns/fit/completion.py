@@ -3,15 +3,17 @@
 import math
 from dataclasses import replace
 
-import torch
+import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
+from kronc_ns.fit.verdict import Evidence, Verdict
 from kronc_ns.fit.walk import Interpolated, interpolate_walk
+from kronc_ns.geometry.poses import posed
 from kronc_ns.geometry.rotations import rotation_angle_deg
 from kronc_ns.scene import Scene
-from kronc_ns.solution import Solution, ViewStatus
-from kronc_ns.solve.lm import LmConfig, adjust
+from kronc_ns.solution import ViewReport, ViewStatus
+from kronc_ns.solve.lm import adjust
+from kronc_ns.solve.options import LmConfig
 from kronc_ns.solve.problem import OrbitPrior, Problem, State
 
 _FEWEST = 2  # keypoints that correct where the walk says a view was aimed
@@ -19,23 +21,24 @@ _BELIEVED_SIGMAS = 3.0  # a correction larger than this is an outlier's
 _NOISE_PX = 1.0  # least noise that is believed of so few detections
 
 
-def complete(scene: Scene, solution: Solution) -> Solution:
-    """The solution with the views that were not solved placed between their neighbours, where there is a walk."""
-    known = torch.tensor([view.status is ViewStatus.SOLVED for view in solution.views])
-    if not known.any():
-        return solution
+def complete(
+    scene: Scene, evidence: Evidence, verdict: Verdict
+) -> tuple[Float[np.ndarray, "n 3 4"], tuple[ViewReport, ...]]:
+    """Poses and reports with the views that were not solved placed between their neighbours, where there is a walk."""
+    solved = verdict.solved
+    c2w = np.where(solved[:, None, None], evidence.c2w, math.nan)
+    if not solved.any() or solved.all():
+        return c2w, verdict.views
     # the walk goes around the z axis through the car
-    middle = solution.points.nanmean(0)
-    centred = solution.c2w.clone()
-    centred[..., 3] -= middle
-    walk = interpolate_walk(centred, known)
+    known = np.isfinite(evidence.points).all(-1)
+    middle = evidence.points[known].mean(0) if known.any() else np.zeros(3)
+    walk = interpolate_walk(_shifted(c2w, -middle), solved)
     if walk is None:
-        return solution
-    c2w = walk.c2w.clone()
-    c2w[..., 3] += middle
-    placed = ~known & c2w.isfinite().all(-1).all(-1)
-    c2w = _aimed(scene, solution, replace(walk, c2w=c2w), placed)
-    views = [
+        return c2w, verdict.views
+    walk = replace(walk, c2w=_shifted(walk.c2w, middle))
+    placed = ~solved & posed(walk.c2w)
+    aimed = _aimed(scene, evidence, verdict, walk, placed)
+    views = tuple(
         replace(
             view,
             status=ViewStatus.COMPLETED,
@@ -45,31 +48,35 @@ def complete(scene: Scene, solution: Solution) -> Solution:
         )
         if placed[i]
         else view
-        for i, view in enumerate(solution.views)
-    ]
-    return replace(solution, c2w=torch.where(placed[:, None, None], c2w, solution.c2w), views=tuple(views))
+        for i, view in enumerate(verdict.views)
+    )
+    return np.where(placed[:, None, None], aimed, c2w), views
 
 
-def _aimed(scene: Scene, solution: Solution, walk: Interpolated, placed: Bool[Tensor, "n"]) -> Float[Tensor, "n 3 4"]:
+def _shifted(c2w: Float[np.ndarray, "n 3 4"], by: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3 4"]:
+    return np.concatenate([c2w[..., :3], (c2w[..., 3] + by)[..., None]], axis=-1)
+
+
+def _aimed(
+    scene: Scene, evidence: Evidence, verdict: Verdict, walk: Interpolated, placed: Bool[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3 4"]:
     """Poses of the walk, turned so that a placed view's few keypoints are met as well; its centre hardly moves."""
-    m = scene.visibility * solution.points.isfinite().all(-1)
+    m = scene.visibility * np.isfinite(evidence.points).all(-1)
     some = placed & (m.sum(1) >= _FEWEST)
     if not some.any():
         return walk.c2w
-    camera = solution.camera
-    principal = torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
+    camera = evidence.camera
     problem = Problem(
-        (scene.uv[some] - principal).transpose(1, 2)[None].contiguous(),
-        m[some][None],
-        torch.tensor([[camera.fx, camera.fy]], dtype=torch.float64),
-        orbit=OrbitPrior(walk.c2w[some][None, ..., 3], walk.sigma_trans_m[some][None] / math.sqrt(3)),
+        scene.uv[some] - (camera.cx, camera.cy),
+        m[some],
+        (camera.fx, camera.fy),
+        orbit=OrbitPrior(walk.c2w[some][..., 3], walk.sigma_trans_m[some] / math.sqrt(3)),
         points_known=True,
     )
-    noise = torch.tensor([max(solution.rmse_px, _NOISE_PX)], dtype=torch.float64)
-    start = State.of(walk.c2w[some][None], solution.points.nan_to_num(0.0)[None])
-    found = adjust(problem, start, LmConfig(loss="huber"), most_sigma_px=noise).state.c2w[0]
-    turned = rotation_angle_deg(found[..., :3].transpose(1, 2) @ walk.c2w[some][..., :3])
+    start = State.of(walk.c2w[some], np.where(np.isfinite(evidence.points), evidence.points, 0.0))
+    found = adjust(problem, start, LmConfig(loss="huber"), most_sigma_px=max(verdict.rmse_px, _NOISE_PX)).state.c2w
+    turned = rotation_angle_deg(found[..., :3].swapaxes(1, 2) @ walk.c2w[some][..., :3])
     believed = turned <= _BELIEVED_SIGMAS * walk.sigma_rot_deg[some]
-    c2w = walk.c2w.clone()
-    c2w[some] = torch.where(believed[:, None, None], found, c2w[some])
+    c2w = walk.c2w.copy()
+    c2w[some] = np.where(believed[:, None, None], found, c2w[some])
     return c2w

@@ -4,16 +4,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+import numpy as np
+from jaxtyping import Bool
 
 from kronc_ns.fit.attempts import Attempt, adjust_starts
 from kronc_ns.fit.options import KroncConfig
-from kronc_ns.fit.starts import LOST, TOLERANCE_SIGMAS, Start, far_side, in_front, locate_views, mirrored, usable_views
-from kronc_ns.keypoints.template import car_template
-from kronc_ns.solve import objective
-from kronc_ns.solve.resection import unexplained
+from kronc_ns.fit.starts import LOST, SWAP_GAIN, Hypothesis, locate_views, single_views, usable_views
+from kronc_ns.geometry.poses import invert
+from kronc_ns.solve.resection import locate, unexplained
 
 _ODD_SHARE = 0.3  # share of a view's detections on the far side of the car that makes the view suspect
 _REPAIRS = 3
@@ -21,72 +19,89 @@ _HOPELESS = 0.02  # of the image diagonal: with such noise the points are no poi
 
 
 def repair(attempts: Sequence[Attempt], config: KroncConfig) -> list[Attempt]:
-    """Find views that disagree or look through the car, locate them anew (also left-right swapped), solve again."""
+    """Find views that disagree or look through the car, locate them anew (also left-right swapped), solve again.
+
+    Nothing is solved again that would only end where it is.
+    """
     attempts = list(attempts)
-    suspects: list[Bool[Tensor, "n"]] = [torch.empty(0, dtype=torch.bool)] * len(attempts)
+    asked: list[Bool[np.ndarray, "n"] | None] = [None] * len(attempts)
     active = list(range(len(attempts)))
     for _ in range(_REPAIRS):
-        changed: list[int] = []
+        changed: dict[int, Hypothesis] = {}
         for i in active:
             suspect = _suspects(attempts[i])
-            if suspect.any() and not torch.equal(suspect, suspects[i]):
-                suspects[i] = suspect
-                attempts[i] = replace(attempts[i], start=_relocated(attempts[i], suspect))
-                changed.append(i)
+            if not suspect.any() or (asked[i] is not None and np.array_equal(suspect, asked[i])):
+                continue
+            asked[i] = suspect
+            mended = _relocated(attempts[i], suspect)
+            if mended is not None:
+                changed[i] = mended
         if not changed:
             break
-        solved = adjust_starts([attempts[i].start for i in changed], config)
-        for i, attempt in zip(changed, solved, strict=True):
+        for i, again in zip(changed, adjust_starts(list(changed.values()), config), strict=True):
+            first = attempts[i]
             attempts[i] = replace(
-                attempt,
-                initial_c2w=attempts[i].initial_c2w,
-                iterations=attempts[i].iterations + attempt.iterations,
-                history=attempts[i].history,
-                path=attempts[i].path,
+                again,
+                start=first.start,
+                iterations=first.iterations + again.iterations,
+                history=first.history,
+                path=first.path,
             )
-        active = changed
+        active = list(changed)
     return attempts
 
 
-def _suspects(attempt: Attempt) -> Bool[Tensor, "n"]:
-    start, camera = attempt.start, attempt.start.scene.camera
-    seen = start.scene.visibility > 0
+def _suspects(attempt: Attempt) -> Bool[np.ndarray, "n"]:
+    found, camera = attempt.found, attempt.found.scene.camera
+    seen = found.scene.seen
     if attempt.sigma_px > _HOPELESS * math.hypot(camera.width, camera.height):
-        return torch.zeros(len(seen), dtype=torch.bool)
-    away = (far_side(start) & seen).sum(1) > _ODD_SHARE * seen.sum(1)
-    few = 2 * attempt.inlier.sum(1) < seen.sum(1)
-    return usable_views(start.scene) & (~attempt.agreeing | few | away)
+        return np.zeros(len(seen), dtype=bool)
+    return usable_views(found.scene) & (_misfits(attempt) | _looks_through(attempt))
 
 
-def _relocated(attempt: Attempt, suspect: Bool[Tensor, "n"]) -> Start:
-    """The start with suspect views where they fit the solved points best, or left out."""
-    start = attempt.start
-    scene = start.scene
+def _misfits(attempt: Attempt) -> Bool[np.ndarray, "n"]:
+    """Views that the noise does not explain."""
+    few = 2 * attempt.inlier.sum(1) < attempt.found.scene.seen.sum(1)
+    return ~attempt.agreeing | few
+
+
+def _looks_through(attempt: Attempt) -> Bool[np.ndarray, "n"]:
+    """Views that see too much of the car's far side: confused sides, or a car of another shape than the template."""
+    seen = attempt.found.scene.seen
+    return (attempt.found.far_side & seen).sum(1) > _ODD_SHARE * seen.sum(1)
+
+
+def _relocated(attempt: Attempt, suspect: Bool[np.ndarray, "n"]) -> Hypothesis | None:
+    """The cameras with suspect views where they fit the solved points best, or left out; None if nothing changes.
+
+    A view that fits is only asked whether it fits better with its sides exchanged.
+    """
+    found = attempt.found
+    scene, sigma = found.scene, attempt.sigma_px
     trusted = (attempt.inlier & ~suspect[:, None]).sum(0) >= 2
-    points = torch.where(trusted[:, None], start.points, math.nan)
-    c2w, cost, swapped = locate_views(scene, points, suspect, attempt.sigma_px)
-    better = suspect & (cost < _present_cost(start, points, attempt.sigma_px))
+    points = np.where(trusted[:, None], found.points, math.nan)
+    present = np.full(len(scene), math.inf)
+    posed = suspect & found.used
+    if posed.any():
+        present[posed] = unexplained(single_views(scene, points, posed, sigma), invert(found.c2w[posed]))
+    misfit = _misfits(attempt)
+    c2w, cost, swapped = locate_views(scene, points, suspect & misfit, sigma)
+    mirror = replace(scene, keypoints=scene.schema.mirrored(scene.keypoints))
+    fitting = suspect & ~misfit
+    if fitting.any():
+        exchanged = locate(single_views(mirror, points, fitting, sigma))
+        c2w[fitting], swapped[fitting] = invert(exchanged.w2c), True
+        cost[fitting] = np.where(exchanged.cost < SWAP_GAIN * present[fitting], exchanged.cost, math.inf)
+    better = suspect & (cost < present)
+    used = np.where(better, cost < LOST, found.used & (attempt.agreeing | ~suspect))
+    if not better.any() and np.array_equal(used, found.used):
+        return None
     swapped &= better
-    keypoints = torch.where(swapped[:, None, None], mirrored(scene.keypoints, scene.schema), scene.keypoints)
+    keypoints = np.where(swapped[:, None, None], mirror.keypoints, scene.keypoints)
     return replace(
-        start,
+        found,
         scene=replace(scene, keypoints=keypoints),
-        c2w=torch.where(better[:, None, None], c2w, start.c2w),
-        used=torch.where(better, cost < LOST, start.used & (attempt.agreeing | ~suspect)),
-        swapped=start.swapped ^ swapped,
+        c2w=np.where(better[:, None, None], c2w, found.c2w),
+        used=used,
+        swapped=found.swapped ^ swapped,
     )
-
-
-def _present_cost(start: Start, points: Float[Tensor, "j 3"], sigma_px: float) -> Float[Tensor, "n"]:
-    """Cost of every view where it is, as `locate` reckons it; inf where it has no pose."""
-    scene, template = start.scene, car_template(start.scene.schema)
-    error = (objective.reproject(points, start.c2w, scene.camera) - scene.uv).norm(dim=-1)
-    cost = unexplained(
-        torch.where(in_front(start), error, math.inf),
-        torch.where(points.isfinite().all(-1), scene.visibility, 0.0),
-        start.c2w,
-        points.expand(len(scene), -1, -1),
-        torch.full((len(scene),), TOLERANCE_SIGMAS * sigma_px, dtype=torch.float64),
-        None if template is None else template.normals,
-    )
-    return torch.where(start.used, cost.nan_to_num(math.inf), math.inf)

@@ -1,18 +1,204 @@
-"""What a solution is worth (being rewritten)."""
+"""What a result is worth: residuals, a report on every view, an overall status with its reason."""
+
 import math
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-from kronc_ns.geometry.camera import reproject
-from kronc_ns.geometry.poses import posed
+from kronc_ns.fit.attempts import agrees
+from kronc_ns.fit.starts import MIN_POINTS
+from kronc_ns.geometry.camera import Camera, reproject
+from kronc_ns.geometry.poses import posed, unit
+from kronc_ns.scene import Scene
+from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
+from kronc_ns.solve.robust import INLIER_SIGMAS, noise_px
+
+MIN_VIEWS = 3
+POOR_FIT = 0.01
+"""A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
+_VAGUE_DEG = 5.0
+"""A median standard deviation of the rotations above this is close to degenerate."""
+_PARALLAX_DEG = 3.0
+"""Views that see the points from within this angle hardly tell how far these are."""
+_ALIKE = 0.005
+"""Keypoints that move less than this share of the diagonal between views show no other side."""
+_SAMPLED_VIEWS = 16
+"""So many views, evenly spread, tell whether all are alike."""
+_ODD_SHAPE = 0.25
+"""Weight of the shape prior below which the solved points hardly look like a car."""
 
 
-def inliers(scene, solution):
-    """Residuals in px [n, j] (NaN where there is none, inf behind a camera), and which are inliers [n, j]."""
-    error = np.linalg.norm(reproject(solution.points, solution.c2w, solution.camera) - scene.uv, axis=-1)
-    known = scene.seen & posed(solution.c2w)[:, None] & np.isfinite(solution.points).all(-1)
-    error = np.where(known, error, math.nan)
-    measured = error[np.isfinite(error)]
-    diagonal = math.hypot(scene.camera.width, scene.camera.height)
-    sigma = max(float(np.median(measured)) / 1.1774, 0.1) if len(measured) else math.inf
-    return error, error <= min(5.0 * sigma, 0.03 * diagonal)
+@dataclass(frozen=True)
+class Evidence:
+    """Poses and points as they will be handed on, and what the solver knows beside them."""
+
+    camera: Camera
+    c2w: Float[np.ndarray, "n 3 4"]
+    """NaN for views that took no part."""
+    points: Float[np.ndarray, "j 3"]
+    """NaN where unknown."""
+    sigma_rot_deg: Float[np.ndarray, "n"]
+    sigma_trans_m: Float[np.ndarray, "n"]
+    swapped: Bool[np.ndarray, "n"]
+    shape_weight: float | None
+    """How usual a car the points make, 1 to 0; None without a template."""
+    converged: bool
+    """Whether the solver came to rest within its steps."""
+    iterations: int
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How far each view and the whole can be trusted."""
+
+    views: tuple[ViewReport, ...]
+    status: Status
+    reason: str
+    rmse_px: float
+    """Root mean square reprojection error over all inliers of solved views; NaN where there is none."""
+    median_px: float
+    """Median reprojection error over all detections in solved views; NaN where there is none."""
+
+    @property
+    def solved(self) -> Bool[np.ndarray, "n"]:
+        """Which views were solved."""
+        return np.array([view.status is ViewStatus.SOLVED for view in self.views], dtype=bool)
+
+
+def inliers(scene: Scene, solution: Solution) -> tuple[Float[np.ndarray, "n j"], Bool[np.ndarray, "n j"]]:
+    """`residuals_px` of a solution, and which of them are as small as the detector's noise explains."""
+    error = residuals_px(scene, solution.camera, solution.c2w, solution.points)
+    return error, _small(scene, error)
+
+
+def residuals_px(
+    scene: Scene, camera: Camera, c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, "n j"]:
+    """Reprojection error of every detection against the solved points; NaN where there is none, inf behind a camera."""
+    error = np.linalg.norm(reproject(points, c2w, camera) - scene.uv, axis=-1)
+    return np.where(scene.seen & posed(c2w)[:, None] & np.isfinite(points).all(-1), error, math.nan)
+
+
+def _small(scene: Scene, error: Float[np.ndarray, "n j"]) -> Bool[np.ndarray, "n j"]:
+    finite = error[np.isfinite(error)]
+    if not len(finite):
+        return np.zeros(error.shape, dtype=bool)
+    return error <= min(INLIER_SIGMAS * noise_px(finite), 3 * POOR_FIT * _diagonal(scene))
+
+
+def judge(scene: Scene, evidence: Evidence) -> Verdict:
+    """A report on every view and the overall status."""
+    error = residuals_px(scene, evidence.camera, evidence.c2w, evidence.points)
+    inlier = _small(scene, error)
+    counted, found, good = (~np.isnan(error)).sum(1), scene.seen.sum(1), inlier.sum(1)
+    rmse = np.sqrt(np.where(inlier, error**2, 0.0).sum(1) / np.maximum(good, 1))
+    agree = agrees(good, counted)
+    views = tuple(
+        _report(name, *numbers, evidence, i)
+        for i, (name, *numbers) in enumerate(
+            zip(
+                scene.names, found.tolist(), counted.tolist(), good.tolist(), agree.tolist(), rmse.tolist(), strict=True
+            )
+        )
+    )
+    solved = np.array([view.status is ViewStatus.SOLVED for view in views], dtype=bool)
+    kept = inlier & solved[:, None]
+    of_solved = error[solved][~np.isnan(error[solved])]
+    finite = error[np.isfinite(error)]
+    median = float(np.median(finite)) if len(finite) else math.inf
+    status, reason = _overall(scene, evidence, solved, kept, median)
+    return Verdict(
+        views,
+        status,
+        reason,
+        float(np.sqrt(np.where(kept, error**2, 0.0).sum() / max(kept.sum(), 1))),
+        float(np.median(of_solved)) if len(of_solved) else math.nan,
+    )
+
+
+def _report(name: str, found: int, seen: int, good: int, agree: bool, rmse: float, of: Evidence, i: int) -> ViewReport:
+    reason = ""
+    if found < MIN_POINTS:
+        reason = f"{found} keypoints, at least {MIN_POINTS} are needed"
+    elif seen == 0:
+        reason = f"no pose was found that agrees with its {found} keypoints"
+    elif not agree:
+        reason = f"only {good} of {seen} keypoints agree with the other views"
+    if reason:
+        return ViewReport(name, ViewStatus.FAILED, found, good, None, reason=reason)
+    rotation, centre = _known(of.sigma_rot_deg[i]), _known(of.sigma_trans_m[i])
+    return ViewReport(name, ViewStatus.SOLVED, found, good, rmse, rotation, centre, swapped=bool(of.swapped[i]))
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _overall(
+    scene: Scene, evidence: Evidence, solved: Bool[np.ndarray, "n"], kept: Bool[np.ndarray, "n j"], median_px: float
+) -> tuple[Status, str]:
+    share = median_px / _diagonal(scene)
+    count, views, with_template = int(solved.sum()), len(scene), evidence.shape_weight is not None
+    fit = f"median reprojection error {median_px:.2f} px ({100 * share:.2f} % of the image diagonal)"
+    if not math.isfinite(median_px):
+        fit = "no detection meets a solved point"
+    if count == 0 or (count < MIN_VIEWS and not with_template):
+        return Status.FAILED, f"{count} of {views} views agree with each other, expected at least {MIN_VIEWS}; {fit}"
+    if share > POOR_FIT:
+        return Status.FAILED, f"the keypoints do not fit together: {fit}, expected below {100 * POOR_FIT:g} %"
+    sigmas = evidence.sigma_rot_deg[solved]
+    vague = float(np.median(sigmas[~np.isnan(sigmas)])) if not np.isnan(sigmas).all() else math.nan
+    problems = []
+    if not evidence.converged:
+        problems.append(f"the solver was still moving after {evidence.iterations} steps: allow more")
+    if count < MIN_VIEWS:
+        problems.append(f"only {count} view{'s' * (count > 1)}: nothing but the car template holds them together")
+    elif not _redundant(kept):
+        problems.append("the views share so few keypoints that any poses would meet them: take more views")
+    if share > POOR_FIT / 2:
+        problems.append("the keypoints fit poorly")
+    if 2 * count < views:
+        problems.append(f"only {count} of {views} views are solved")
+    if count > 1 and (_parallax_deg(evidence, solved) < _PARALLAX_DEG or _all_alike(scene, solved)):
+        problems.append("all views are from the same place: take them from around the object")
+    if not vague <= _VAGUE_DEG:
+        problems.append(f"the views are barely determined (median standard deviation {vague:.1f} deg): take more views")
+    if evidence.shape_weight is not None and evidence.shape_weight < _ODD_SHAPE:
+        problems.append("the points hardly look like a car: are the keypoints in the schema's order?")
+    if problems:
+        return Status.WEAK, f"{'; '.join(problems)}; {fit}"
+    return Status.CONVERGED, f"{count} of {views} views solved; {fit}"
+
+
+def _redundant(kept: Bool[np.ndarray, "n j"]) -> bool:
+    """Whether the detections that agree are more than what they determine: poses and points, but for the gauge."""
+    shared = kept & (kept.sum(0) >= 2)
+    views, points = int(shared.any(1).sum()), int(shared.any(0).sum())
+    return 2 * int(shared.sum()) > 6 * views + 3 * points - 7
+
+
+def _parallax_deg(evidence: Evidence, solved: Bool[np.ndarray, "n"]) -> float:
+    """Largest angle between the mean direction from which the points are seen and that of a view."""
+    known = np.isfinite(evidence.points).all(-1)
+    middle = evidence.points[known].mean(0) if known.any() else np.zeros(3)
+    direction = unit(evidence.c2w[solved][..., 3] - middle)
+    mean = unit(direction.mean(0))
+    return math.degrees(math.acos(max(-1.0, min(1.0, float((direction @ mean).min())))))
+
+
+def _all_alike(scene: Scene, solved: Bool[np.ndarray, "n"]) -> bool:
+    """Whether the views show the same picture: then poses differ by the start's doing only."""
+    chosen = np.flatnonzero(solved)
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLED_VIEWS)).astype(int)]
+    seen = scene.seen[chosen]
+    shared = seen.sum(0) > 1
+    if not shared.any():
+        return False
+    uv = np.where(seen[..., None], scene.uv[chosen], math.nan)[:, shared]
+    off = np.linalg.norm(uv - np.nanmedian(uv, axis=0), axis=-1)
+    return float(np.nanmedian(off)) < _ALIKE * _diagonal(scene)
+
+
+def _diagonal(scene: Scene) -> float:
+    return math.hypot(scene.camera.width, scene.camera.height)

@@ -4,12 +4,11 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
-
 from kronc_ns.errors import KroncError
+from kronc_ns.files.images import read_grey
 
 
-def check_positive(**options: float) -> None:
+def check_positive(**options: float | int) -> None:
     """Options that must be finite and above 0."""
     for name, value in options.items():
         if not (math.isfinite(value) and value > 0):
@@ -32,12 +31,8 @@ def check_not_negative(**options: int) -> None:
 
 def check_masks(masks: Sequence[Path]) -> None:
     """At least one mask must leave something of its image."""
-    for path in masks:
-        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if mask is None:
-            raise KroncError(f"{path} is no image: expected a mask with 0 outside the car")
-        if mask.any():
-            return
+    if any(read_grey(path).any() for path in masks):
+        return
     raise KroncError(
         f"all {len(masks)} masks are empty, {masks[0]} the first: expected the car not to be 0; give other masks, or "
         "--background keep to train on the full frames"

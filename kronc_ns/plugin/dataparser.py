@@ -5,13 +5,13 @@ nerfstudio loads dataparsers while those are still being imported.
 """
 
 import sys
-from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
@@ -21,21 +21,20 @@ from torch import Tensor
 
 from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, report_table
 from kronc_ns.commands.options import SolverOptions
-from kronc_ns.errors import KroncError
-from kronc_ns.files.cache import read_report, solve_cached
-from kronc_ns.files.output import read_json
+from kronc_ns.files.cache import solve_cached
+from kronc_ns.files.record import read_record, read_solution
 from kronc_ns.files.scene_folder import load_scene
-from kronc_ns.files.transforms import camera_and_frames, check_file_names, read_poses
+from kronc_ns.files.transforms import check_file_names
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import flip_camera_axes
 from kronc_ns.plugin.checks import check_masks, check_not_negative, check_positive
-from kronc_ns.plugin.images import cut_out, downscaled
+from kronc_ns.plugin.images import cut_out
 from kronc_ns.plugin.seeds import Seeds, box_seeds, grey, ground_seeds
+from kronc_ns.plugin.views import SolvedViews, image_level, solved_views, test_views
 from kronc_ns.plugin.visual_hull import carve, read_pictures
+from kronc_ns.plugin.world import world_around
 from kronc_ns.scene import Scene
-from kronc_ns.solution import Status
-
-_BOX_MARGIN = 0.1  # of the car's length: keypoints stop short of tyres, mirrors and the roof
+from kronc_ns.solution import Solution, Status
 
 
 @dataclass
@@ -77,7 +76,7 @@ class KroncDataParser(DataParser):
 
     def __init__(self, config: KroncDataParserConfig) -> None:
         super().__init__(config=config)
-        self._solved: tuple[Scene, dict[str, Tensor], dict[str, Any]] | None = None
+        self._solved: tuple[Scene, Solution] | None = None
 
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
         config = self.config
@@ -88,140 +87,89 @@ class KroncDataParser(DataParser):
                 self._solved = self._solve()
             return self._outputs(split, *self._solved)
 
-    def _solve(self) -> tuple[Scene, dict[str, Tensor], dict[str, Any]]:
-        """The scene, poses (OpenCV c2w) by file name of the views that have one, and the report of the solution."""
+    def _solve(self) -> tuple[Scene, Solution]:
+        """The scene, and its solution: that of a solved folder, else from the cache, else solved now."""
         config = self.config
         scene = load_scene(config.data, config.keypoints)
         check_file_names(scene.names, config.data / "transforms.json")
-        report = read_report(config.data)
-        if report is not None and config.keypoints is None and not config.any_solver_option():
-            folder = config.data
-        else:
+        folder = config.data
+        if not (folder / "kronc.json").exists() or config.keypoints is not None or config.any_solver_option():
             with progress_bar("solving poses") as progress:
                 folder = solve_cached(config.data, scene, config.solver_config(), progress)
-            report = read_report(folder)
-        assert report is not None
-        CONSOLE.print(report_table(report, scene.notes))
-        doubt = exit_status(report)
-        if report["status"] == Status.FAILED.value:
+        record, (_, solution) = read_record(folder), read_solution(folder)
+        CONSOLE.print(report_table(record, scene.notes))
+        doubt = exit_status(record)
+        if solution.status is Status.FAILED:
             sys.exit(doubt)
-        poses = read_poses(folder / "transforms.json")
-        camera, _ = camera_and_frames(read_json(folder / "transforms.json"), folder / "transforms.json")
-        scene = replace(scene, camera=camera)  # its intrinsics may have been refined
-        return scene, {PurePosixPath(name).name: pose for name, pose in poses.items()}, report
+        return scene, solution
 
-    def _outputs(self, split: str, scene: Scene, poses: dict[str, Tensor], report: dict[str, Any]) -> DataparserOutputs:
-        config = self.config
-        everyone = [PurePosixPath(view["file_path"]).name for view in report["views"]]
-        tested = test_views(len(everyone), config.eval_interval, config.eval_fraction).tolist()
-        is_test = dict(zip(everyone, tested, strict=True))
-        test = torch.tensor([is_test.get(PurePosixPath(name).name, False) for name in scene.names])
-        posed = torch.tensor([PurePosixPath(name).name in poses for name in scene.names])
-        chosen = {"train": ~test & posed, "val": test & posed, "test": test & posed, "all": posed}.get(split)
-        if chosen is None:
-            raise KroncError(f"unknown split {split!r}: expected train, val, test or all")
-        if not chosen.any():
-            raise KroncError(
-                f"no view is left for the {split} split: {int(posed.sum())} of {len(scene)} views have a pose"
-            )
-        indices = chosen.nonzero()[:, 0].tolist()
-
-        all_c2w = torch.stack([poses[PurePosixPath(scene.names[i]).name] for i in posed.nonzero()[:, 0].tolist()])
-        points = torch.tensor([p for p in report["points"] if None not in p], dtype=torch.float64).reshape(-1, 3)
-        box = car_box(points, all_c2w, config.scene_scale)
-        centre = box.mean(0)
-        scale = config.scale_factor / float((all_c2w[..., 3] - centre).norm(dim=-1).max())
-        c2w = torch.stack([poses[PurePosixPath(scene.names[i]).name] for i in indices])
-        c2w[..., 3] = (c2w[..., 3] - centre) * scale
-        move = torch.cat([torch.eye(3), -centre.float()[:, None]], dim=1)
-
-        camera, factor = scene.camera, downscaled(config.data, scene, config.downscale_factor)
-        images = [factor.path(scene.names[i]) for i in indices]
-        masks = [factor.path(scene.masks[i]) for i in indices] if scene.masks else None
-        missing = [path for path in [*images, *(masks or [])] if not path.exists()]
-        if missing:
-            remedy = "" if factor.factor == 1 else "; `ns-process-data kronc` writes those of 1/2, 1/4 and 1/8"
-            raise KroncError(
-                f"{missing[0]} does not exist: training needs the images ({len(missing)} are missing){remedy}"
-            )
-        if masks is not None and config.background != "keep":
-            check_masks(masks)
+    def _outputs(self, split: str, scene: Scene, solution: Solution) -> DataparserOutputs:
+        config, camera = self.config, solution.camera  # whose intrinsics may have been refined
+        test = test_views(len(solution.names), config.eval_interval, config.eval_fraction)
+        everyone = solved_views(config.data, scene, solution, test)
+        level = image_level(everyone.images[0], (camera.width, camera.height), config.downscale_factor)
+        views = everyone.of_split(split).at_level(level)
+        if views.masks is not None and config.background != "keep":
+            check_masks(views.masks)
+        points = solution.points[np.isfinite(solution.points).all(-1)]
+        world = world_around(points, everyone.c2w[everyone.posed], config.scene_scale, config.scale_factor)
         seeds = grey(points)
         if split == "train":  # models start from the training views' metadata
-            chosen_c2w = torch.stack([poses[PurePosixPath(scene.names[i]).name] for i in indices])
-            seeds += self._seeds(box, chosen_c2w, images, masks, camera)
-        if config.background == "white" and masks is not None:
-            images = cut_out(images, masks)
-        cameras = Cameras(
-            camera_to_worlds=flip_camera_axes(c2w).float(),
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
-            width=camera.width,
-            height=camera.height,
-            distortion_params=torch.tensor([camera.k1, camera.k2, 0.0, 0.0, camera.p1, camera.p2]).expand(
-                len(indices), -1
-            ),
-            camera_type=CameraType.PERSPECTIVE,
-        )
-        cameras.rescale_output_resolution(scaling_factor=1.0 / factor.factor)
+            seeds += self._seeds(views, camera, world.box)
+        cut = config.background == "white" and views.masks is not None
         return DataparserOutputs(
-            image_filenames=images,
-            cameras=cameras,
+            image_filenames=cut_out(views.images, views.masks) if cut else list(views.images),
+            cameras=_cameras(world.of_poses(views.c2w), camera, level),
             alpha_color=None if config.background == "keep" else torch.ones(3),
-            scene_box=SceneBox(aabb=((box - centre) * scale).float()),
-            mask_filenames=masks if config.background == "mask" else None,
-            dataparser_transform=move,
-            dataparser_scale=scale,
-            metadata={"points3D_xyz": ((seeds.points - centre) * scale).float(), "points3D_rgb": seeds.colours},
+            scene_box=SceneBox(aabb=_tensor(world.of_points(world.box))),
+            mask_filenames=list(views.masks) if config.background == "mask" and views.masks is not None else None,
+            dataparser_transform=torch.cat([torch.eye(3), -_tensor(world.centre)[:, None]], dim=1),
+            dataparser_scale=world.scale,
+            metadata={
+                "points3D_xyz": _tensor(world.of_points(seeds.points)),
+                "points3D_rgb": torch.from_numpy(seeds.colours),
+            },
         )
 
-    def _seeds(
-        self,
-        box: Float[Tensor, "2 3"],
-        c2w: Float[Tensor, "n 3 4"],
-        images: list[Path],
-        masks: list[Path] | None,
-        camera: Camera,
-    ) -> Seeds:
+    def _seeds(self, views: SolvedViews, camera: Camera, box: Float[np.ndarray, "2 3"]) -> Seeds:
         """Points to start from, in the solved world: the visual hull, or else random points."""
-        count = self.config.num_seed_points
-        if masks is not None and self.config.seeds == "hull":
-            points, colours = carve(read_pictures(images, masks, camera), c2w, box, count)
-            if len(points) and self.config.background == "keep":
-                return Seeds(points, colours) + ground_seeds(box, c2w, count // 2)
-            if len(points):
-                return Seeds(points, colours)
-            CONSOLE.print("[yellow]the masks leave nothing of the car in its box: starting from random points[/yellow]")
-        if masks is not None and self.config.background != "keep":
-            return box_seeds(box, count)
-        return box_seeds(box, count) + ground_seeds(box, c2w, count // 2)
+        count, full_frame = self.config.num_seed_points, self.config.background == "keep"
+        ground = ground_seeds(box, views.c2w, count // 2)
+        if views.masks is None:
+            return box_seeds(box, count) + ground
+        car = box_seeds(box, count)
+        if self.config.seeds == "hull":
+            hull = carve(read_pictures(views.images, views.masks, camera), views.c2w, box, count)
+            if len(hull.points):
+                car = hull
+            else:
+                CONSOLE.print(
+                    "[yellow]the masks leave nothing of the car in its box: starting from random points[/yellow]"
+                )
+        return car + ground if full_frame else car
 
 
-def test_views(views: int, interval: int, fraction: float | None) -> Bool[Tensor, "n"]:
-    """Which views are test views: every ``interval``-th from the first on, or an evenly spread ``fraction``."""
-    test = torch.zeros(views, dtype=torch.bool)
-    if fraction is None:
-        if interval < 2:
-            raise KroncError(f"eval_interval is {interval}: expected 2 or more, or nothing is left to train on")
-        test[::interval] = True
-    else:
-        if not 0 < fraction < 1:
-            raise KroncError(f"eval_fraction is {fraction}: expected a share above 0 and below 1")
-        count = min(max(1, round(views * fraction)), views - 1)
-        test[torch.from_numpy(np.linspace(0, views, count, endpoint=False).astype(np.int64))] = True
-    return test
+def _cameras(c2w: Float[np.ndarray, "n 3 4"], camera: Camera, level: int) -> Cameras:
+    """nerfstudio's cameras at ``c2w`` (OpenCV axes) for images at 1/``level`` of their size."""
+    distortion = torch.tensor([camera.k1, camera.k2, 0.0, 0.0, camera.p1, camera.p2])
+    cameras = Cameras(
+        camera_to_worlds=_tensor(flip_camera_axes(c2w)),
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        width=camera.width,
+        height=camera.height,
+        distortion_params=distortion.expand(len(c2w), -1),
+        camera_type=CameraType.PERSPECTIVE,
+    )
+    cameras.rescale_output_resolution(scaling_factor=1.0 / level)
+    return cameras
 
 
-def car_box(points: Float[Tensor, "j 3"], c2w: Float[Tensor, "n 3 4"], scale: float = 1.0) -> Float[Tensor, "2 3"]:
-    """Lower and upper corner of the solved keypoints' box with a margin, scaled about its centre."""
-    if len(points) < 2:
-        raise KroncError(f"{len(points)} solved keypoints: expected at least 2 to know where the object is")
-    low, high = points.amin(0), points.amax(0)
-    margin = _BOX_MARGIN * (high - low).max()
-    centre, half = (low + high) / 2, (high - low) / 2 + margin
-    return torch.stack([centre - scale * half, centre + scale * half])
+def _tensor(array: Float[np.ndarray, "*n"]) -> Float[Tensor, "*n"]:
+    """Numbers as nerfstudio takes them."""
+    return torch.from_numpy(array).float()
 
 
 kronc_dataparser = DataParserSpecification(

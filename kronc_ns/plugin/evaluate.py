@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
@@ -73,8 +72,10 @@ def _plain(metrics: ImageMetrics | None) -> dict[str, float | None] | None:
 
 def _picture(view: RenderedView) -> UInt8[np.ndarray, "h w3 3"]:
     """Rendered, truth and their mean absolute difference over the channels, side by side."""
-    rendered, truth = ((255 * image).round().byte().cpu().numpy() for image in (view.rendered, view.truth))
-    error = (view.rendered - view.truth).abs().mean(-1) / ERROR_LIMIT
-    levels = (255 * error.clamp(0, 1)).byte().cpu().numpy()
+    import cv2
+
+    rendered, truth = (np.rint(255 * image).astype(np.uint8) for image in (view.rendered, view.truth))
+    error = np.abs(view.rendered - view.truth).mean(-1) / ERROR_LIMIT
+    levels = (255 * error.clip(0, 1)).astype(np.uint8)
     shown = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     return np.concatenate([rendered, truth, shown], axis=1)

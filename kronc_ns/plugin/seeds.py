@@ -1,44 +1,42 @@
-"""Points for splatfacto to start from."""
+"""Points for splatfacto to start from, in the solved world."""
 
-import math
 from dataclasses import dataclass
 
-import torch
+import numpy as np
 from jaxtyping import Float, UInt8
-from torch import Tensor
 
 _GREY = 128
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Coloured points in the world."""
+    """Coloured points."""
 
-    points: Float[Tensor, "p 3"]
-    colours: UInt8[Tensor, "p 3"]
+    points: Float[np.ndarray, "p 3"]
+    colours: UInt8[np.ndarray, "p 3"]
 
     def __add__(self, other: "Seeds") -> "Seeds":
-        return Seeds(torch.cat([self.points, other.points]), torch.cat([self.colours, other.colours]))
+        return Seeds(
+            np.concatenate([self.points, other.points]),
+            np.concatenate([self.colours, other.colours]),
+        )
 
 
-def grey(points: Float[Tensor, "p 3"]) -> Seeds:
+def grey(points: Float[np.ndarray, "p 3"]) -> Seeds:
     """Points whose colour is not known."""
-    return Seeds(points, torch.full(points.shape, _GREY, dtype=torch.uint8))
+    return Seeds(points, np.full(points.shape, _GREY, dtype=np.uint8))
 
 
-def box_seeds(box: Float[Tensor, "2 3"], count: int) -> Seeds:
+def box_seeds(box: Float[np.ndarray, "2 3"], count: int) -> Seeds:
     """Points drawn uniformly from the car's box; always the same."""
-    uniform = torch.rand(count, 3, dtype=box.dtype, generator=torch.Generator().manual_seed(0))
-    return grey(box[0] + uniform * (box[1] - box[0]))
+    return grey(np.random.default_rng(0).uniform(box[0], box[1], (count, 3)))
 
 
-def ground_seeds(box: Float[Tensor, "2 3"], c2w: Float[Tensor, "n 3 4"], count: int) -> Seeds:
+def ground_seeds(box: Float[np.ndarray, "2 3"], c2w: Float[np.ndarray, "n 3 4"], count: int) -> Seeds:
     """Points on the level of the box's underside, out to where the cameras stand; always the same."""
-    generator = torch.Generator().manual_seed(1)
     middle = box.mean(0)
-    reach = float((c2w[:, :2, 3] - middle[:2]).norm(dim=-1).max())
-    radius, angle = torch.rand(2, count, dtype=box.dtype, generator=generator)
-    radius, angle = reach * radius.sqrt(), 2 * math.pi * angle
-    level = box[0, 2].expand(count)
-    flat = torch.stack([middle[0] + radius * angle.cos(), middle[1] + radius * angle.sin(), level], dim=1)
-    return grey(flat)
+    reach = np.linalg.norm(c2w[:, :2, 3] - middle[:2], axis=-1).max()
+    share, turn = np.random.default_rng(1).random((2, count))
+    radius, angle = reach * np.sqrt(share), 2 * np.pi * turn
+    level = np.full(count, box[0, 2])
+    return grey(np.stack([middle[0] + radius * np.cos(angle), middle[1] + radius * np.sin(angle), level], axis=1))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 from jaxtyping import Bool, Float
@@ -15,7 +16,6 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.utils.eval_utils import eval_setup
-from torch import Tensor
 
 from kronc_ns.errors import KroncError
 from kronc_ns.metrics.images import Lpips
@@ -28,10 +28,10 @@ class RenderedView:
     """A rendering beside the photo it is to equal; images are in [0, 1]."""
 
     image: Path
-    rendered: Float[Tensor, "h w 3"]
-    truth: Float[Tensor, "h w 3"]
+    rendered: Float[np.ndarray, "h w 3"]
+    truth: Float[np.ndarray, "h w 3"]
     """The photo; where it has alpha, on the background that was trained on."""
-    mask: Bool[Tensor, "h w"] | None
+    mask: Bool[np.ndarray, "h w"] | None
     """True on the vehicle; None where neither a mask nor alpha says where that is."""
 
 
@@ -51,8 +51,10 @@ class TrainedRun:
     @property
     def lpips(self) -> Lpips | None:
         """The model's own LPIPS; None where its weights are missing."""
-        lpips = getattr(self.pipeline.model, "lpips", None)
-        return None if isinstance(lpips, UnavailableLpips) else lpips
+        lpips, device = getattr(self.pipeline.model, "lpips", None), self.pipeline.device
+        if lpips is None or isinstance(lpips, UnavailableLpips):
+            return None
+        return lambda *images: float(lpips(*(torch.from_numpy(image).to(device) for image in images)))
 
     @torch.no_grad()
     def render(self) -> Iterator[RenderedView]:
@@ -68,11 +70,11 @@ class TrainedRun:
                 )
             outputs = model.get_outputs_for_camera(camera)
             # nerfstudio's models lay the photo, on their background, and the rendering side by side
-            pair = model.get_image_metrics_and_images(outputs, batch)[1]["img"].clamp(0, 1)
+            pair = model.get_image_metrics_and_images(outputs, batch)[1]["img"].clamp(0, 1).cpu().numpy()
             mask = self._mask(i, undistorted=isinstance(datamanager, FullImageDatamanager))
-            yield RenderedView(image, pair[:, -width:], pair[:, :width], None if mask is None else mask.to(pair.device))
+            yield RenderedView(image, pair[:, -width:], pair[:, :width], mask)
 
-    def _mask(self, i: int, undistorted: bool) -> Bool[Tensor, "h w"] | None:
+    def _mask(self, i: int, undistorted: bool) -> Bool[np.ndarray, "h w"] | None:
         """Where the vehicle is in a photo: by its mask, else by its alpha."""
         photo = self.photos.get_data(i)
         mask = photo["mask"] if "mask" in photo else photo["image"][..., 3:] >= 0.5
@@ -84,7 +86,7 @@ class TrainedRun:
             image, intrinsics = photo["image"].numpy(), camera.get_intrinsics_matrices().numpy()
             mask = _undistort_image(camera, distortion.numpy(), {"mask": mask}, image, intrinsics)[2]
             assert mask is not None
-        return mask[..., 0]
+        return mask[..., 0].numpy()
 
 
 def load_run(config_file: Path) -> TrainedRun:

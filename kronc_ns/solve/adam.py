@@ -6,15 +6,18 @@ preallocated buffers, without a graph: about three times the speed of autograd o
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.solve.options import AdamConfig
-from kronc_ns.solve.threads import one_thread
 
 _TINY = 1e-12
 
@@ -23,15 +26,15 @@ _TINY = 1e-12
 class AdamResult:
     """Where Algorithm 1 ended."""
 
-    c2w: Float[Tensor, "n 3 4"]
-    depths: Float[Tensor, "n j"]
-    points: Float[Tensor, "j 3"]
+    c2w: Float[np.ndarray, "n 3 4"]
+    depths: Float[np.ndarray, "n j"]
+    points: Float[np.ndarray, "j 3"]
     """Centroids C^j; zero for keypoints that no view sees."""
     steps: int
     seconds: float
     history: dict[str, list[float]]
     """"step" and "loss" at about a hundred steps."""
-    path: Float[Tensor, "s n 3 4"]
+    path: Float[np.ndarray, "s n 3 4"]
     """Poses before each of them."""
 
 
@@ -177,33 +180,36 @@ class LossGradient:
 
 
 def minimise(
-    c2w: Float[Tensor, "n 3 4"],
-    depths: Float[Tensor, "n j"],
-    uv: Float[Tensor, "n j 2"],
-    m: Float[Tensor, "n j"],
-    focal: tuple[float, float],
-    principal: tuple[float, float],
+    c2w: Float[np.ndarray, "n 3 4"],
+    depths: Float[np.ndarray, "n j"],
+    uv: Float[np.ndarray, "n j 2"],
+    m: Float[np.ndarray, "n j"],
+    camera: Camera,
     config: AdamConfig,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
     progress: Callable[[int, float], None] | None = None,
 ) -> AdamResult:
-    """Run Algorithm 1 from the given poses (c2w, OpenCV axes) and z-depths, on their device and dtype.
+    """Run Algorithm 1 from the given poses (c2w, OpenCV axes) and z-depths, in float32; auto takes a GPU if there is one.
 
     ``uv`` are undistorted pixels, ``m`` the visibility. ``progress(step, loss)`` is called about a hundred times.
     """
     start = time.perf_counter()
-    gradient = LossGradient(c2w, depths, uv, m, focal, principal, (config.weight_3d, config.weight_2d))
-    fused = c2w.is_cuda or torch.__version__ >= "2.4"
+    on = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+    tensors = (torch.from_numpy(np.ascontiguousarray(x)).to(on, torch.float32) for x in (c2w, depths, uv, m))
+    focal, principal = (camera.fx, camera.fy), (camera.cx, camera.cy)
+    gradient = LossGradient(*tensors, focal, principal, (config.weight_3d, config.weight_2d))
+    fused = on.type == "cuda" or torch.__version__ >= "2.4"
     optimiser = torch.optim.Adam([gradient.parameters], lr=config.learning_rate, fused=fused)
     report_every = max(1, config.steps // 100)
     history: dict[str, list[float]] = {"step": [], "loss": []}
     path: list[Tensor] = []
     best, best_step, step = math.inf, 0, 0
     floor = config.learning_rate * config.decay
-    with torch.no_grad(), one_thread():
+    with torch.no_grad(), _one_thread():
         for step in range(1, config.steps + 1):
             norms = gradient.evaluate()
             if not config.optimise_depths:
-                gradient.parameters.grad[-depths.numel() :] = 0.0  # pyright: ignore[reportOptionalSubscript]
+                gradient.parameters.grad[-depths.size :] = 0.0  # pyright: ignore[reportOptionalSubscript]
             cosine = 0.5 * (1 + math.cos(math.pi * (step - 1) / config.steps))
             optimiser.param_groups[0]["lr"] = floor + (config.learning_rate - floor) * cosine
             if step % report_every == 0 or step == 1:
@@ -218,6 +224,23 @@ def minimise(
                 elif config.patience and step - best_step >= config.patience:
                     break
             optimiser.step()
-        points = gradient.centroids().T.contiguous()
+        points = gradient.centroids().T
     seconds = time.perf_counter() - start
-    return AdamResult(gradient.pose(), gradient.z.clone(), points, step, seconds, history, torch.stack(path))
+    return AdamResult(
+        *(_array(x) for x in (gradient.pose(), gradient.z, points)), step, seconds, history, _array(torch.stack(path))
+    )
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.double().cpu().numpy()
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one CPU thread: the tensors are too small to share, and idle threads would only spin for the cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

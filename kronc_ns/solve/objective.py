@@ -1,15 +1,23 @@
 """The paper's equations as pure functions of tensors; autograd goes through all of them.
 
-N views, J keypoints. ``m [N, J]`` is the visibility, ``uv [N, J, 2]`` the detected pixels, ``z [N, J]`` the
-z-depths, ``c2w [N, 3, 4]`` the poses (the paper's R_i, t_i).
+N views, J keypoints. ``m [N, J]`` is the visibility, ``uv [N, J, 2]`` the detected pixels, ``z [N, J]`` the z-depths,
+``c2w [N, 3, 4]`` the poses (the paper's R_i, t_i). `adam` evaluates the same with a gradient that is written out.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from kronc_ns.geometry.camera import Camera, backproject, project
-from kronc_ns.geometry.poses import invert, transform
+from kronc_ns.geometry.camera import Camera
+
+
+def backproject(
+    uv: Float[Tensor, "n j 2"], z: Float[Tensor, "n j"], c2w: Float[Tensor, "n 3 4"], camera: Camera
+) -> Float[Tensor, "n j 3"]:
+    """World points of pixels at z-depth ``z`` (eq. 1): R_i z K^-1 (u, v, 1) + t_i."""
+    x, y = (uv[..., 0] - camera.cx) / camera.fx, (uv[..., 1] - camera.cy) / camera.fy
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    return (rays * z[..., None]) @ c2w[..., :3].mT + c2w[:, None, :, 3]
 
 
 def centroids(points: Float[Tensor, "n j 3"], m: Float[Tensor, "n j"]) -> Float[Tensor, "j 3"]:
@@ -19,8 +27,9 @@ def centroids(points: Float[Tensor, "n j 3"], m: Float[Tensor, "n j"]) -> Float[
 
 
 def reproject(centroid: Float[Tensor, "j 3"], c2w: Float[Tensor, "n 3 4"], camera: Camera) -> Float[Tensor, "n j 2"]:
-    """Pixels of every centroid in every view (eq. 3)."""
-    return project(transform(invert(c2w), centroid.expand(len(c2w), -1, -1)), camera)
+    """Pixels of every centroid in every view (eq. 3): K R_i^T (C^j - t_i), divided by its depth."""
+    x, y, z = ((centroid - c2w[:, None, :, 3]) @ c2w[..., :3]).unbind(-1)
+    return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
 
 
 def distances(

@@ -1,39 +1,18 @@
-"""What bundle adjustment knows and seeks: measurements, priors and unknowns of a batch of scenes.
+"""What bundle adjustment knows and seeks: measurements, priors and unknowns of a scene.
 
-Arrays of views and keypoints are planar, [B, N, component, J]: B scenes, N views, J keypoints. The unknowns of the
-reduced system are ordered (x of all points, y of all, z of all, intrinsics).
+N views, J keypoints. The unknowns of the reduced system are ordered (x of all points, y of all, z of all, intrinsics).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Literal, TypeVar
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
+from jaxtyping import Float
 
 from kronc_ns.geometry.poses import invert, make_pose
+from kronc_ns.solve.robust import REDUNDANCY_MOST
 
-Record = TypeVar("Record", bound="Batched")
-
-
-class Batched:
-    """A dataclass of tensors (or of such dataclasses) with the scenes in front."""
-
-    def each(self: Record, function: Callable[..., Tensor], *others: Record) -> Record:
-        """``function`` of every tensor and its counterparts in ``others``."""
-        changes = {}
-        for f in fields(self):  # pyright: ignore[reportArgumentType]
-            value = getattr(self, f.name)
-            if isinstance(value, Tensor):
-                changes[f.name] = function(value, *(getattr(other, f.name) for other in others))
-            elif isinstance(value, Batched):
-                changes[f.name] = value.each(function, *(getattr(other, f.name) for other in others))
-        return replace(self, **changes)  # pyright: ignore[reportArgumentType]
-
-    def __getitem__(self: Record, scenes: Int[Tensor, "c"]) -> Record:
-        return self.each(lambda x: x[scenes])
+Intrinsic = Literal["focal", "k1"]
 
 
 @dataclass(frozen=True)
@@ -43,114 +22,75 @@ class ShapePrior:
     Arrays are in the planar order of the reduced system.
     """
 
-    mean: Float[Tensor, "p"]
-    precision: Float[Tensor, "p p"]
+    mean: Float[np.ndarray, "p"]
+    precision: Float[np.ndarray, "p p"]
     """Inverse covariance."""
     freedom: float = 20.0
     """Degrees of freedom of the tail (Student t): the fewer, the sooner an unusual shape is believed."""
 
     @staticmethod
-    def of(mean: Float[Tensor, "j 3"], precision: Float[Tensor, "p p"]) -> "ShapePrior":
+    def of(mean: Float[np.ndarray, "j 3"], precision: Float[np.ndarray, "p p"]) -> "ShapePrior":
         """Prior from a mean shape and an inverse covariance in the order index = 3 * point + axis."""
-        order = torch.arange(mean.numel(), device=mean.device).view(-1, 3).T.flatten()
-        return ShapePrior(mean.T.flatten(), precision[order][:, order].contiguous())
-
-    def to(self, device: torch.device) -> "ShapePrior":
-        """The same on a device."""
-        return replace(self, mean=self.mean.to(device), precision=self.precision.to(device))
-
-    @staticmethod
-    def nothing(like: Tensor) -> "ShapePrior":
-        """What the compiled loops take for no prior."""
-        return ShapePrior(like.new_empty(0), like.new_empty(0, 0))
+        order = np.arange(mean.size).reshape(-1, 3).T.ravel()
+        return ShapePrior(mean.T.ravel(), np.ascontiguousarray(precision[np.ix_(order, order)]))
 
 
 @dataclass(frozen=True)
-class OrbitPrior(Batched):
+class OrbitPrior:
     """Expected camera centres, such as those of a smooth walk."""
 
-    centre: Float[Tensor, "b n 3"]
-    sigma: Float[Tensor, "b n"]
+    centre: Float[np.ndarray, "n 3"]
+    sigma: Float[np.ndarray, "n"]
     """Standard deviation per axis; inf where nothing is expected."""
 
 
 @dataclass(frozen=True)
-class Problem(Batched):
-    """What a batch of scenes measured."""
+class Problem:
+    """What a scene measured."""
 
-    uv: Float[Tensor, "b n 2 j"]
-    """Undistorted pixels less the principal point, planar."""
-    weight: Float[Tensor, "b n j"]
+    uv: Float[np.ndarray, "n j 2"]
+    """Undistorted pixels less the principal point."""
+    weight: Float[np.ndarray, "n j"]
     """Weight of each detection's squared error; 0: not seen."""
-    focal: Float[Tensor, "b 2"]
+    focal: tuple[float, float]
     shape: ShapePrior | None = None
     orbit: OrbitPrior | None = None
-    refine: tuple[Literal["focal", "k1"], ...] = ()
+    refine: tuple[Intrinsic, ...] = ()
     """Shared intrinsics that are unknown too."""
     points_known: bool = False
-    """Whether only the cameras are sought (resection)."""
-
-    def to(self, device: torch.device) -> "Problem":
-        """The same on a device, the prior that all scenes share included."""
-        shape = None if self.shape is None else self.shape.to(device)
-        return replace(self.each(lambda x: x.to(device)), shape=shape)
+    """Whether only the cameras are sought."""
 
     @property
-    def plain(self) -> bool:
-        """Whether the loops compiled for the CPU serve: doubles there, no orbit, no unknown intrinsics."""
-        ours = self.uv.device.type == "cpu" and self.uv.dtype == torch.float64
-        return ours and self.orbit is None and not self.refine
+    def redundancy(self) -> float:
+        """Factor from the spread of residuals to that of the detections: the unknowns take up part of the noise."""
+        seen = self.weight > 0
+        views, points = int(seen.any(1).sum()), int((seen.sum(0) > 1).sum())
+        unknown = 6 * views + (0 if self.points_known else 3 * points - 7)
+        measured = 2 * max(int(seen.sum()), 1)
+        return min((measured / max(measured - unknown, 1e-9)) ** 0.5, REDUNDANCY_MOST)
 
 
 @dataclass(frozen=True)
-class State(Batched):
-    """The unknowns of a batch of scenes."""
+class State:
+    """The unknowns of a scene."""
 
-    rotation: Float[Tensor, "b n 3 3"]
+    rotation: Float[np.ndarray, "n 3 3"]
     """World to camera."""
-    translation: Float[Tensor, "b n 3"]
+    translation: Float[np.ndarray, "n 3"]
     """World to camera."""
-    points: Float[Tensor, "b j 3"]
-    intrinsics: Float[Tensor, "b k"]
-    """As far as `Problem.refine` names them: logarithm of the focal length's factor; k1."""
+    points: Float[np.ndarray, "j 3"]
+    log_growth: float = 0.0
+    """Logarithm of the factor of the focal length."""
+    k1: float = 0.0
+    """First radial distortion coefficient, beyond what the pixels have been undistorted by."""
 
     @property
-    def c2w(self) -> Float[Tensor, "b n 3 4"]:
+    def c2w(self) -> Float[np.ndarray, "n 3 4"]:
         """Camera poses."""
         return invert(make_pose(self.rotation, self.translation))
 
     @staticmethod
-    def of(c2w: Float[Tensor, "b n 3 4"], points: Float[Tensor, "b j 3"], unknown: int = 0) -> "State":
-        """State with the given poses and ``unknown`` intrinsics as the camera has them."""
-        rotation = c2w[..., :3].transpose(-1, -2).contiguous()
-        translation = -(rotation @ c2w[..., 3:])[..., 0]
-        return State(rotation, translation, points, points.new_zeros(len(points), unknown))
-
-
-@dataclass(frozen=True)
-class Residuals(Batched):
-    """Reprojection of every point into every view, planar."""
-
-    plane: Float[Tensor, "b n 2 j"]
-    """Normalised image coordinates before k1."""
-    inverse_z: Float[Tensor, "b n 1 j"]
-    error: Float[Tensor, "b n 2 j"]
-    """Projection minus detection in pixels; 0 where nothing is seen."""
-    norm: Float[Tensor, "b n j"]
-    """Length of the error in pixels times the root of its weight; `BEHIND_PX` behind the camera."""
-    surprise: Float[Tensor, "b"]
-    """Squared Mahalanobis distance of the points under the shape prior; 0 without one."""
-    pull: Float[Tensor, "b p"]
-    """Half its gradient by the points."""
-
-
-def focal_of(problem: Problem, state: State) -> Float[Tensor, "b 2"]:
-    """Focal length in pixels, refined or not."""
-    if "focal" in problem.refine:
-        return problem.focal * state.intrinsics[:, problem.refine.index("focal"), None].exp()
-    return problem.focal
-
-
-def array(tensor: Tensor) -> np.ndarray:
-    """A tensor on the CPU as compiled loops take it."""
-    return tensor.contiguous().numpy()
+    def of(c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"]) -> "State":
+        """State with the given poses and the intrinsics as the camera has them."""
+        w2c = invert(c2w)
+        return State(np.ascontiguousarray(w2c[..., :3]), np.ascontiguousarray(w2c[..., 3]), points)

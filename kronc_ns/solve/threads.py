@@ -1,52 +1,36 @@
-"""How a solver uses the threads of the CPU."""
+"""How solving uses the cores: many scenes side by side, or else the parts of one."""
 
+import os
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
-import torch
-
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 _local = threading.local()
+_FEWEST = 64
+"""With less to do, a second thread costs more than it saves."""
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Compute on one CPU thread: the tensors are too small to share, and idle threads would only spin for the cores.
+def side_by_side(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
+    """``map`` on all cores, in the items' order; within it nothing is split into parts."""
 
-    So do threads that begin meanwhile.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+    def alone(item: _Item) -> _Result:
+        _local.alone = True
+        return function(item)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        yield from pool.map(alone, items)
 
 
-@contextmanager
-def turn(lock: threading.Lock) -> Iterator[None]:
-    """Compute in this thread only while holding ``lock``, but for what is done `aside`.
-
-    Threads that run small tensor operations at the same time hand the interpreter back and forth at every one of them
-    and are slower together than one after the other.
-    """
-    _local.lock = lock
-    try:
-        with lock:
-            yield
-    finally:
-        del _local.lock
-
-
-@contextmanager
-def aside() -> Iterator[None]:
-    """A compiled loop, which needs no interpreter: meanwhile another thread may have its `turn`."""
-    lock = getattr(_local, "lock", None)
-    if lock is None:
-        yield
+def in_parts(run: Callable[[slice], None], count: int) -> None:
+    """``run`` over slices of ``range(count)``, one for each core: for compiled loops, which need no interpreter."""
+    cores = os.cpu_count() or 1
+    if count < _FEWEST or cores < 2 or getattr(_local, "alone", False):
+        run(slice(0, count))
         return
-    lock.release()
-    try:
-        yield
-    finally:
-        lock.acquire()
+    size = -(-count // cores)
+    with ThreadPoolExecutor(cores) as pool:
+        for _ in pool.map(run, [slice(first, min(first + size, count)) for first in range(0, count, size)]):
+            pass

@@ -12,7 +12,6 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from torch import Tensor
 
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import Camera
@@ -36,7 +35,7 @@ _WALL_SEGMENTS = 128
 
 
 def blender_views(
-    car: MeshCar, c2w: Float[Tensor, "n 3 4"], camera: Camera, ground: bool
+    car: MeshCar, c2w: Float[np.ndarray, "n 3 4"], camera: Camera, ground: bool
 ) -> Generator[UInt8[np.ndarray, "h w 4"], None, None]:
     """RGBA (straight alpha) of each view in turn: with the car park and its sun, or the car alone.
 
@@ -72,7 +71,7 @@ def blender_views(
             process.wait()
 
 
-def _job(car: MeshCar, c2w: Float[Tensor, "n 3 4"], camera: Camera, ground: bool, folder: Path) -> dict[str, Any]:
+def _job(car: MeshCar, c2w: Float[np.ndarray, "n 3 4"], camera: Camera, ground: bool, folder: Path) -> dict[str, Any]:
     """What the worker reads, and the pictures that it names."""
     if any(camera.distortion):
         raise KroncError(f"lens distortion {camera.distortion}: Blender renders pinhole cameras only")
@@ -85,7 +84,7 @@ def _job(car: MeshCar, c2w: Float[Tensor, "n 3 4"], camera: Camera, ground: bool
         "ground": None,
         "frames": [
             {"file": str(folder / f"{i:05d}.png"), "c2w_opengl": [*pose, [0, 0, 0, 1]]}
-            for i, pose in enumerate(flip_camera_axes(c2w.double()).tolist())
+            for i, pose in enumerate(flip_camera_axes(c2w).tolist())
         ],
     }
     cv2.imwrite(job["sky"], np.round(255 * _sky_panorama()[..., ::-1]).astype(np.uint8))

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 import trimesh
+from jaxtyping import Float64, Int
 
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.synthetic.car_paint import (
@@ -66,14 +67,14 @@ class CarModel:
     """The dimensions it was built from."""
     mesh: trimesh.Trimesh
     """All triangles, with smooth vertex normals; metres, x forward, y left, z up."""
-    face_material: np.ndarray
-    """[F] index into `materials`."""
+    face_material: Int[np.ndarray, "f"]
+    """Index into `materials`."""
     materials: tuple[Material, ...]
     """Materials of the faces."""
     layers: dict[str, Layer]
     """Projected textures by name."""
-    keypoints: np.ndarray
-    """[66,3] float64 points on the mesh in the ApolloCar3D order."""
+    keypoints: Float64[np.ndarray, "66 3"]
+    """Points on the mesh in the ApolloCar3D order."""
 
 
 def _bent(points: list[tuple[float, float]], sag: float, half_width: float) -> np.ndarray:
@@ -148,8 +149,8 @@ MIRROR = np.array(APOLLOCAR3D_66.flip)
 """Mirror partner of each keypoint."""
 
 
-def _keypoints(mesh: trimesh.Trimesh, outlines: dict[str, np.ndarray]) -> np.ndarray:
-    """Casts the left keypoints onto the mesh along their view direction and mirrors them: [66,3] metres."""
+def _keypoints(mesh: trimesh.Trimesh, outlines: dict[str, np.ndarray]) -> Float64[np.ndarray, "66 3"]:
+    """Casts the left keypoints onto the mesh along their view direction and mirrors them; metres."""
     index = np.array(list(KEYPOINTS))
     views = np.array([name.split("_")[0] for name, _ in KEYPOINTS.values()])
     at = np.array([outlines[name][vertex] for name, vertex in KEYPOINTS.values()])

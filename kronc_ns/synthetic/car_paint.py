@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from kronc_ns.synthetic.car_parts import CarShape, deck_height, tail_height
 from kronc_ns.synthetic.texture import mip_levels
@@ -22,16 +23,16 @@ RED, DARK_RED, AMBER = (190, 22, 26), (120, 12, 18), (228, 132, 30)
 class Layer:
     """A texture projected along one direction onto the surfaces that face it."""
 
-    facing: np.ndarray
-    """[3] unit vector from the car to the viewer of this texture."""
-    right: np.ndarray
-    """[3] unit vector of increasing columns."""
-    up: np.ndarray
-    """[3] unit vector of decreasing rows."""
+    facing: Float[np.ndarray, "3"]
+    """Unit vector from the car to the viewer of this texture."""
+    right: Float[np.ndarray, "3"]
+    """Unit vector of increasing columns."""
+    up: Float[np.ndarray, "3"]
+    """Unit vector of decreasing rows."""
     corner: tuple[float, float]
     """Metres along `right` and `up` at the upper left corner of the image."""
-    levels: tuple[np.ndarray, ...]
-    """Mip levels of the image, [H,W,5] uint8: red, green, blue, alpha, gloss; all premultiplied by alpha."""
+    levels: tuple[UInt8[np.ndarray, "_ _ 5"], ...]
+    """Mip levels of the image: red, green, blue, alpha, gloss; all premultiplied by alpha."""
     min_cos: float
     """Applied where the surface normal has at least this cosine with `facing`."""
 

@@ -113,11 +113,11 @@ class CarShape:
 
 @dataclass(frozen=True)
 class Part:
-    """Triangles of one material: `vertices [v,3]`, unit `normals [v,3]`, `faces [f,3]`."""
+    """Triangles of one material, with unit normals at their vertices; metres."""
 
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
+    vertices: Float[np.ndarray, "v 3"]
+    normals: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
     material: str
 
     def mirrored(self) -> Part:

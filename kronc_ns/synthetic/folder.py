@@ -9,7 +9,6 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 from typing_extensions import assert_never
 
 from kronc_ns.errors import KroncError
@@ -28,7 +27,7 @@ Renderer = Literal["builtin", "blender"]
 def write_capture(
     folder: Path,
     capture: Capture,
-    start: Float[Tensor, "n 3 4"] | None = None,
+    start: Float[np.ndarray, "n 3 4"] | None = None,
     render: bool = False,
     ground: bool = True,
     progress: Callable[[int], None] | None = None,
@@ -57,7 +56,7 @@ def write_capture(
                 if progress is not None:
                     progress(i + 1)
     size = (capture.camera.width, capture.camera.height)
-    rows = dict(zip(names, capture.keypoints.numpy(), strict=True))
+    rows = dict(zip(names, capture.keypoints, strict=True))
     write_keypoints(folder / "keypoints.json", APOLLOCAR3D_66, size, rows)
     write_json(folder / "reference.json", transforms_dict(capture.camera, names, capture.c2w, masks, depths))
     write_json(folder / "transforms.json", transforms_dict(capture.camera, names, start, masks, depths))
@@ -75,17 +74,16 @@ def _renderings(capture: Capture, ground: bool, renderer: Renderer) -> Generator
     """Every view, drawn by the builtin ray caster or by Blender; masks and depth maps are ray-cast with both."""
     camera, car = capture.camera, capture.car
     assert car is not None
-    poses = capture.c2w.numpy()
     match renderer:
         case "builtin":
             assert not isinstance(car, MeshCar)
-            for c2w in poses:
+            for c2w in capture.c2w:
                 yield render_view(car, c2w, camera, ground=ground)
         case "blender":
             with TemporaryDirectory(prefix="kronc-car-") as place:
                 mesh_car = car if isinstance(car, MeshCar) else write_mesh_car(car, Path(place) / "car.glb")
                 with closing(blender_views(mesh_car, capture.c2w, camera, ground)) as pictures:
-                    for rgba, c2w in zip(pictures, poses, strict=True):
+                    for rgba, c2w in zip(pictures, capture.c2w, strict=True):
                         yield Rendering(rgba, *trace_mask_and_depth(mesh_car.mesh, c2w, camera, ground=ground))
         case _:
             assert_never(renderer)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
@@ -125,8 +125,10 @@ def write_mesh_car(car: CarModel, file: Path) -> MeshCar:
     return load_mesh_car(file)
 
 
-def _paint(car: CarModel, corners: Float[np.ndarray, "f 3 3"], source: Int[np.ndarray, "f"]) -> np.ndarray:
-    """Tiles [f,T,T,4] uint8 of red, green, blue, gloss; a triangle's corners are their top left, right and bottom."""
+def _paint(
+    car: CarModel, corners: Float[np.ndarray, "f 3 3"], source: Int[np.ndarray, "f"]
+) -> UInt8[np.ndarray, "f t t 4"]:
+    """Tiles of red, green, blue, gloss; a triangle's corners are their top left, right and bottom."""
     b, a = np.meshgrid(*[np.linspace(0, 1, _TILE)] * 2, indexing="ij")
     weights = np.stack([1 - a - b, a, b], -1).reshape(-1, 3)  # also beyond the third edge, for filters to read
     points = (weights @ corners).reshape(-1, 3)

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from kronc_ns.geometry.camera import Camera, rays
+from kronc_ns.geometry.poses import unit
 from kronc_ns.synthetic.car import CarModel
 from kronc_ns.synthetic.car_paint import METRES_PER_TEXEL
 from kronc_ns.synthetic.surroundings import SUN, shade_surroundings, sky_colour, surroundings_distance
@@ -26,12 +26,12 @@ RAYS_PER_CHUNK = 400_000
 class Rendering:
     """One rendered view."""
 
-    rgba: np.ndarray
-    """[H,W,4] uint8, straight alpha: the share of the pixel the car covers, or 255 with a background."""
-    mask: np.ndarray
-    """[H,W] uint8: 255 where the car is the nearest surface at the pixel centre."""
-    depth: np.ndarray
-    """[H,W] float32: z-depth in metres of the nearest surface at the pixel centre, 0 where there is none."""
+    rgba: UInt8[np.ndarray, "h w 4"]
+    """Straight alpha: the share of the pixel the car covers, or 255 with a background."""
+    mask: UInt8[np.ndarray, "h w"]
+    """255 where the car is the nearest surface at the pixel centre."""
+    depth: Float32[np.ndarray, "h w"]
+    """z-depth in metres of the nearest surface at the pixel centre, 0 where there is none."""
 
 
 def keypoint_visibility(
@@ -40,7 +40,7 @@ def keypoint_visibility(
     centres: Float[np.ndarray, "n 3"],
     tolerance_m: float = 0.02,
 ) -> Bool[np.ndarray, "n j"]:
-    """Whether the straight line from each camera centre [n,3] reaches each surface point [j,3] unobstructed."""
+    """Whether the straight line from each camera centre reaches each surface point unobstructed (metres, world)."""
     ray = points[None] - centres[:, None]
     distance = np.linalg.norm(ray, axis=-1)
     start = np.broadcast_to(centres[:, None], ray.shape).reshape(-1, 3)
@@ -48,8 +48,10 @@ def keypoint_visibility(
     return hit_distance.reshape(distance.shape) >= distance - tolerance_m
 
 
-def _first_hit(mesh: trimesh.Trimesh, start: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [n] along unit rays to the nearest face and its index [n]; infinite and -1 for a miss."""
+def _first_hit(
+    mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """Distance along unit rays to the nearest face, and its index; infinite and -1 for a miss."""
     face = np.asarray(mesh.ray.intersects_first(start, direction))
     hit = np.flatnonzero(face >= 0)
     distance = np.full(len(face), np.inf)
@@ -90,7 +92,7 @@ def trace_mask_and_depth(
     camera: Camera,
     *,
     ground: bool,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[UInt8[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Mask and depth as in `Rendering`, by one ray through each pixel's centre."""
     ray, _ = _camera_rays(c2w, camera, np.arange(camera.height))
     start = np.broadcast_to(c2w[:, 3], ray.shape)
@@ -103,15 +105,19 @@ def trace_mask_and_depth(
     return mask.reshape(shape), z.astype(np.float32).reshape(shape)
 
 
-def _camera_rays(c2w: np.ndarray, camera: Camera, rows: np.ndarray) -> tuple[np.ndarray, float]:
-    """Unit rays [rows * width, 3] in the world through pixel centres, and the angle of a pixel in radians."""
+def _camera_rays(
+    c2w: Float[np.ndarray, "3 4"], camera: Camera, rows: Int[np.ndarray, "h"]
+) -> tuple[Float[np.ndarray, "n 3"], float]:
+    """Unit rays in the world through the pixel centres of rows (n = h width), and the angle of a pixel in radians."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, rows + 0.5), -1).reshape(-1, 2)
-    ray = rays(camera.undistort(torch.from_numpy(pixels)), camera).numpy() @ c2w[:, :3].T
-    return ray / np.linalg.norm(ray, axis=1, keepdims=True), 1 / min(camera.fx, camera.fy)
+    ray = rays(camera.undistort(pixels), camera) @ c2w[:, :3].T
+    return unit(ray), 1 / min(camera.fx, camera.fy)
 
 
-def _shade_rays(car: CarModel, eye: np.ndarray, ray: np.ndarray, footprint: float, ground: bool) -> np.ndarray:
-    """Premultiplied colour and coverage [n,4] in 0..1 along rays from `eye`."""
+def _shade_rays(
+    car: CarModel, eye: Float[np.ndarray, "3"], ray: Float[np.ndarray, "n 3"], footprint: float, ground: bool
+) -> Float32[np.ndarray, "n 4"]:
+    """Premultiplied colour and coverage in 0..1 along rays from `eye`."""
     start = np.broadcast_to(eye, ray.shape)
     distance, face = _first_hit(car.mesh, start, ray)
     hit = face >= 0
@@ -125,8 +131,14 @@ def _shade_rays(car: CarModel, eye: np.ndarray, ray: np.ndarray, footprint: floa
     return out
 
 
-def _shade_car(car: CarModel, p: np.ndarray, ray: np.ndarray, face: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    """Colour [n,3] of points on the car: layers over the base colour, sun, sky, sheen and reflections."""
+def _shade_car(
+    car: CarModel,
+    p: Float[np.ndarray, "n 3"],
+    ray: Float[np.ndarray, "n 3"],
+    face: Int[np.ndarray, "n"],
+    footprint: Float[np.ndarray, "n"],
+) -> Float[np.ndarray, "n 3"]:
+    """Colour of points on the car: layers over the base colour, sun, sky, sheen and reflections."""
     normal = interpolated_normal(car.mesh, face, p)
     normal *= -np.sign(np.einsum("ni,ni->n", car.mesh.face_normals[face], ray) *
                        np.einsum("ni,ni->n", car.mesh.face_normals[face], normal))[:, None]  # fmt: skip
@@ -135,8 +147,7 @@ def _shade_car(car: CarModel, p: np.ndarray, ray: np.ndarray, face: np.ndarray, 
     occluded = np.clip(0.45 + 0.55 * (p[:, 2] - 0.05) / 0.5, 0.45, 1)
     sky = (0.52 + 0.24 * normal[:, 2]) * occluded
     light = sky + 0.48 * np.clip(normal @ SUN, 0, None)
-    half = SUN - ray
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    half = unit(SUN - ray)
     sheen = gloss * 0.40 * np.clip(np.einsum("ni,ni->n", normal, half), 0, None) ** (20 + 60 * gloss)
     fresnel = gloss**2 * (0.12 + 0.60 * (1 - cos_view) ** 3)
     mirror = ray + 2 * cos_view[:, None] * normal
@@ -146,18 +157,23 @@ def _shade_car(car: CarModel, p: np.ndarray, ray: np.ndarray, face: np.ndarray, 
     return np.clip(shaded, 0, 1)
 
 
-def interpolated_normal(mesh: trimesh.Trimesh, face: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Unit normals [n,3] interpolated from the vertices of each face at points on it."""
+def interpolated_normal(
+    mesh: trimesh.Trimesh, face: Int[np.ndarray, "n"], p: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Unit normals interpolated from the vertices of each face at points on it."""
     corner = mesh.faces[face]
     bary = trimesh.triangles.points_to_barycentric(mesh.vertices[corner], p)
-    normal = np.einsum("nk,nki->ni", bary, mesh.vertex_normals[corner])
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return unit(np.einsum("nk,nki->ni", bary, mesh.vertex_normals[corner]))
 
 
 def albedo(
-    car: CarModel, p: np.ndarray, normal: np.ndarray, face: np.ndarray, footprint: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Colour [n,3] in 0..1 and gloss [n] after the material's layers are painted over its base."""
+    car: CarModel,
+    p: Float[np.ndarray, "n 3"],
+    normal: Float[np.ndarray, "n 3"],
+    face: Int[np.ndarray, "n"],
+    footprint: Float[np.ndarray, "n"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    """Colour and gloss in 0..1 after the material's layers are painted over its base, for pixels `footprint` m wide."""
     base = np.array([(*m.rgb, 255 * m.gloss) for m in car.materials]) / 255
     value = base[car.face_material[face]]
     for name, layer in car.layers.items():
@@ -171,8 +187,8 @@ def albedo(
     return value[:, :3], value[:, 3]
 
 
-def _contact_shadow(car: CarModel, p: np.ndarray) -> np.ndarray:
-    """Brightness [n] of the ground at p: dark under the car, fading out beside it, more so away from the sun."""
+def _contact_shadow(car: CarModel, p: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Brightness of the ground at p: dark under the car, fading out beside it, more so away from the sun."""
     edge = np.abs(p[:, :2] + 0.18 * SUN[:2]) - np.array([car.shape.length / 2 - 0.12, car.shape.width / 2 - 0.08])
     distance = np.hypot(*np.maximum(edge, 0).T) + np.minimum(edge.max(1), 0)
     step = np.clip((distance + 0.30) / 0.85, 0, 1)

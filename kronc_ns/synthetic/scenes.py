@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 from typing_extensions import assert_never
 
-from kronc_ns.geometry.camera import Camera, project
-from kronc_ns.geometry.poses import compose, invert, look_at, make_pose, transform
+from kronc_ns.geometry.camera import Camera, reproject
+from kronc_ns.geometry.poses import camera_z, compose, look_at, make_pose
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.synthetic.car import CarModel, CarShape, build_car
 from kronc_ns.synthetic.hull import hull_visibility
@@ -20,6 +18,8 @@ from kronc_ns.synthetic.render import keypoint_visibility
 
 Preset = Literal["carpatch", "walk"]
 HEMISPHERE_RADIUS_M = 6.5
+_AIM = np.array([0.0, 0.0, 0.7])  # what cameras face: the middle of the car
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class Capture:
 
     car: CarModel | MeshCar | None
     """What was captured; None where only its keypoints are known (such a capture cannot be rendered)."""
-    points: Float[Tensor, "j 3"]
+    points: Float[np.ndarray, "j 3"]
     """True keypoints; the world is the car's frame (x forward, y left, z up, ground z = 0), metres."""
     camera: Camera
-    c2w: Float[Tensor, "n 3 4"]
+    c2w: Float[np.ndarray, "n 3 4"]
     """True poses in that world, OpenCV axes."""
-    keypoints: Float[Tensor, "n j 3"]
+    keypoints: Float[np.ndarray, "n j 3"]
     """Detections (u, v, confidence)."""
-    wild: Bool[Tensor, "n j"]
+    wild: Bool[np.ndarray, "n j"]
     """Which detections are outliers: nothing but chance relates them to their point."""
 
 
@@ -51,19 +51,18 @@ def default_camera(preset: Preset, width: int | None = None) -> Camera:
     return camera if width is None else camera.scaled(width / camera.width)
 
 
-def hemisphere_poses(views: int, radius_m: float, rng: np.random.Generator) -> Float[Tensor, "n 3 4"]:
+def hemisphere_poses(views: int, radius_m: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3 4"]:
     """Cameras drawn uniformly from the sphere's zone 5 to 60 degrees above the car's centre, all facing it."""
-    azimuth = torch.from_numpy(rng.uniform(0, 2 * math.pi, views))
-    sine = torch.from_numpy(rng.uniform(math.sin(math.radians(5)), math.sin(math.radians(60)), views))
-    cosine = (1 - sine.square()).sqrt()
-    target = torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64)
-    centres = target + radius_m * torch.stack([cosine * azimuth.cos(), cosine * azimuth.sin(), sine], dim=1)
-    return look_at(centres, target.expand_as(centres), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    azimuth = rng.uniform(0, 2 * math.pi, views)
+    sine = rng.uniform(math.sin(math.radians(5)), math.sin(math.radians(60)), views)
+    cosine = np.sqrt(1 - sine**2)
+    centres = _AIM + radius_m * np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine], axis=1)
+    return look_at(centres, np.broadcast_to(_AIM, centres.shape), _UP)
 
 
 def walk_poses(
     views: int, rng: np.random.Generator, radius_m: float = 5.0, laps: float = 1.0, clockwise: bool = False
-) -> Float[Tensor, "n 3 4"]:
+) -> Float[np.ndarray, "n 3 4"]:
     """A person with a phone on a lap: radius, pace and height sway smoothly, the aim jitters by about a degree."""
     phase = np.arange(views) / views
 
@@ -79,45 +78,43 @@ def walk_poses(
     radius = radius_m + sway(0.3)
     height = 1.5 + sway(0.05) + rng.normal(0, 0.01, views)
     centres = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
-    target = np.array([0.0, 0.0, 0.7]) + np.stack([sway(0.15), sway(0.15), sway(0.05)], axis=1)
-    aimed = look_at(
-        torch.from_numpy(centres), torch.from_numpy(target), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    )
-    shake = so3_exp(torch.from_numpy(rng.normal(0, math.radians(1.0), (views, 3))))
-    return compose(aimed, make_pose(shake, torch.zeros(views, 3, dtype=torch.float64)))
+    targets = _AIM + np.stack([sway(0.15), sway(0.15), sway(0.05)], axis=1)
+    shake = so3_exp(rng.normal(0, math.radians(1.0), (views, 3)))
+    return compose(look_at(centres, targets, _UP), make_pose(shake, np.zeros((views, 3))))
 
 
 def detect(
-    uv: Float[Tensor, "n j 2"],
-    visible: Bool[Tensor, "n j"],
+    uv: Float[np.ndarray, "n j 2"],
+    visible: Bool[np.ndarray, "n j"],
     camera: Camera,
     rng: np.random.Generator,
     noise_px: float = 0.0,
     missing: float = 0.0,
     outliers: float = 0.0,
-) -> tuple[Float[Tensor, "n j 3"], Bool[Tensor, "n j"]]:
+) -> tuple[Float[np.ndarray, "n j 3"], Bool[np.ndarray, "n j"]]:
     """Simulated detector: normal pixel noise (per axis), a share of points missed, a share anywhere on the car's box.
 
     Returns the detections and which of them are outliers. Points outside the image are never seen. Confidence is 1
     for every detection: a detector's outliers are sure of themselves.
     """
     n, j = visible.shape
-    low = torch.where(visible[..., None], uv, torch.inf).amin(1, keepdim=True)
-    high = torch.where(visible[..., None], uv, -torch.inf).amax(1, keepdim=True)
-    noise = torch.from_numpy(rng.normal(size=(n, j, 2)))
-    anywhere = torch.from_numpy(rng.uniform(size=(n, j, 2)))
-    missed, wild = torch.from_numpy(rng.uniform(size=(2, n, j))).unbind(0)
+    inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(-1)
+    low = np.where(visible[..., None], uv, np.inf).min(1, keepdims=True)
+    high = np.where(visible[..., None], uv, -np.inf).max(1, keepdims=True)
+    noise = rng.normal(size=(n, j, 2))
+    anywhere = rng.uniform(size=(n, j, 2))
+    missed, wild = rng.uniform(size=(2, n, j))
     outlier = wild < outliers
-    detected = torch.where(outlier[..., None], low + (high - low) * anywhere, uv + noise_px * noise)
-    size = torch.tensor([camera.width, camera.height], dtype=uv.dtype)
-    seen = visible & (missed >= missing) & ((uv >= 0) & (uv < size)).all(-1) & detected.isfinite().all(-1)
-    keypoints = torch.cat([torch.where(seen[..., None], detected, 0.0), seen[..., None].to(uv.dtype)], dim=-1)
+    with np.errstate(invalid="ignore"):  # where nothing is visible there is no box
+        detected = np.where(outlier[..., None], low + (high - low) * anywhere, uv + noise_px * noise)
+    seen = visible & inside & (missed >= missing) & np.isfinite(detected).all(-1)
+    keypoints = np.concatenate([np.where(seen[..., None], detected, 0.0), seen[..., None]], axis=-1)
     return keypoints, outlier & seen
 
 
 def observe(
-    subject: CarModel | MeshCar | Float[Tensor, "j 3"],
-    c2w: Float[Tensor, "n 3 4"],
+    subject: CarModel | MeshCar | Float[np.ndarray, "j 3"],
+    c2w: Float[np.ndarray, "n 3 4"],
     camera: Camera,
     rng: np.random.Generator,
     noise_px: float = 0.0,
@@ -127,14 +124,13 @@ def observe(
     """A capture of a car (visibility by ray casting) or of bare points (by their convex hull) from given poses."""
     centres = c2w[..., 3]
     if isinstance(subject, CarModel | MeshCar):
-        car, points = subject, torch.from_numpy(subject.keypoints)
-        visible = torch.from_numpy(keypoint_visibility(car.mesh, car.keypoints, centres.numpy()))
+        car, points = subject, subject.keypoints
+        visible = keypoint_visibility(car.mesh, points, centres)
     else:
-        car, points = None, subject.double()
-        visible = torch.from_numpy(hull_visibility(points.numpy(), centres.numpy()))
-    in_camera = transform(invert(c2w), points.expand(len(c2w), -1, -1))
-    visible &= in_camera[..., 2] > 0.1
-    uv = camera.distort(project(in_camera, camera))
+        car, points = None, subject
+        visible = hull_visibility(points, centres)
+    visible &= camera_z(c2w, points) > 0.1
+    uv = camera.distort(reproject(points, c2w, camera))
     keypoints, wild = detect(uv, visible, camera, rng, noise_px, missing, outliers)
     return Capture(car, points, camera, c2w, keypoints, wild)
 

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from kronc_ns.synthetic.texture import mip_levels, sample
 
@@ -16,14 +17,16 @@ SUN = np.array([0.45, 0.52, 0.73]) / np.linalg.norm([0.45, 0.52, 0.73])
 WALL_RADIUS_M, WALL_HEIGHT_M, GROUND_HALF_M = 25.0, 14.0, 26.0
 
 
-def ground_distance(start: np.ndarray, ray: np.ndarray) -> np.ndarray:
-    """Distance [n] along unit rays to the ground plane, infinite above the horizon."""
+def ground_distance(start: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Distance along unit rays to the ground plane, infinite above the horizon."""
     falling = ray[:, 2] < -1e-6
     return np.where(falling, start[:, 2] / np.where(falling, -ray[:, 2], 1), np.inf)
 
 
-def wall_hit(start: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [n] to the far side of the cylinder of buildings (infinite through its sky) and its texture [n,4]."""
+def wall_hit(
+    start: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 4"]]:
+    """Distance along unit rays to the far side of the cylinder of buildings (infinite through its sky); its texture."""
     a = np.maximum((ray[:, :2] ** 2).sum(1), 1e-12)
     b = (start[:, :2] * ray[:, :2]).sum(1)
     root = b**2 - a * ((start[:, :2] ** 2).sum(1) - WALL_RADIUS_M**2)
@@ -38,8 +41,8 @@ def wall_hit(start: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.where(texture[:, 3] > 0.5, distance, np.inf), texture
 
 
-def sky_colour(ray: np.ndarray) -> np.ndarray:
-    """Sky [n,3] along unit rays: pale at the horizon, blue above, with soft clouds."""
+def sky_colour(ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Sky along unit rays: pale at the horizon, blue above, with soft clouds."""
     up = np.clip(ray[:, 2], 0, 1)[:, None]
     sky = np.array([0.80, 0.85, 0.90]) * (1 - up**0.6) + np.array([0.36, 0.56, 0.86]) * up**0.6
     x, y = (ray[:, i] / (0.25 + up[:, 0]) for i in (0, 1))
@@ -48,15 +51,21 @@ def sky_colour(ray: np.ndarray) -> np.ndarray:
     return sky * (1 - cover) + 0.96 * cover
 
 
-def surroundings_distance(start: np.ndarray, ray: np.ndarray) -> np.ndarray:
-    """Distance [n] along unit rays to the ground or the buildings, infinite where the sky shows."""
+def surroundings_distance(start: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Distance along unit rays to the ground or the buildings, infinite where the sky shows."""
     return np.minimum(ground_distance(start, ray), wall_hit(start, ray)[0])
 
 
 def shade_surroundings(
-    start: np.ndarray, ray: np.ndarray, footprint: float, shadow: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """Colour [n,3] of ground, distant buildings and sky; ``shadow`` is the brightness [n] of ground points [n,3]."""
+    start: Float[np.ndarray, "n 3"],
+    ray: Float[np.ndarray, "n 3"],
+    footprint: float,
+    shadow: Callable[[np.ndarray], np.ndarray],
+) -> Float[np.ndarray, "n 3"]:
+    """Colour of ground, distant buildings and sky along unit rays whose pixels are `footprint` radians wide.
+
+    ``shadow`` gives the brightness [m] of ground points [m,3].
+    """
     distance = ground_distance(start, ray)
     wall_distance, wall = wall_hit(start, ray)
     out = sky_colour(ray) * (1 - wall[:, 3:]) + wall[:, :3]
@@ -72,7 +81,7 @@ def shade_surroundings(
 
 
 @lru_cache(maxsize=1)
-def ground_levels() -> tuple[np.ndarray, ...]:
+def ground_levels() -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
     """Mip levels of the car park floor seen from above: row 0 is at the largest x, column 0 at the largest y."""
     rng, size = np.random.default_rng(11), 3072
     scale = size / (2 * GROUND_HALF_M)
@@ -122,8 +131,8 @@ def ground_levels() -> tuple[np.ndarray, ...]:
 
 
 @lru_cache(maxsize=1)
-def wall_levels() -> tuple[np.ndarray, ...]:
-    """Mip levels of the panorama around the car park [H,W,4], alpha 0 where the sky shows."""
+def wall_levels() -> tuple[UInt8[np.ndarray, "_ _ 4"], ...]:
+    """Mip levels of the panorama around the car park, alpha 0 where the sky shows."""
     rng, width = np.random.default_rng(5), 4096
     scale = width / (2 * np.pi * WALL_RADIUS_M)
     height = round(WALL_HEIGHT_M * scale)

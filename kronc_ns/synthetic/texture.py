@@ -1,10 +1,11 @@
 """Pictures on surfaces: halvings of a texture, and its values between the texels."""
 
 import numpy as np
+from jaxtyping import Float, Float32, UInt8
 
 
-def mip_levels(image: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The image [H,W,C] and its successive halvings, each the mean over 2 x 2 texels."""
+def mip_levels(image: UInt8[np.ndarray, "h w c"]) -> tuple[UInt8[np.ndarray, "_ _ c"], ...]:
+    """The image and its successive halvings, each the mean over 2 x 2 texels."""
     levels = [image]
     while min(levels[-1].shape[:2]) > 8:
         height, width = (n // 2 * 2 for n in levels[-1].shape[:2])
@@ -13,8 +14,13 @@ def mip_levels(image: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(levels)
 
 
-def sample(levels: tuple[np.ndarray, ...], column: np.ndarray, row: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Bilinear texture values [n,C] in 0..1 at texel coordinates of level 0, from the level that fits `size` texels."""
+def sample(
+    levels: tuple[UInt8[np.ndarray, "_ _ c"], ...],
+    column: Float[np.ndarray, "n"],
+    row: Float[np.ndarray, "n"],
+    size: Float[np.ndarray, "n"],
+) -> Float32[np.ndarray, "n c"]:
+    """Bilinear texture values in 0..1 at texel coordinates of level 0, from the level that fits `size` texels."""
     level = np.clip(np.round(np.log2(np.maximum(size, 1))), 0, len(levels) - 1).astype(int)
     out = np.empty((len(column), levels[0].shape[2]), np.float32)
     for i in np.unique(level):

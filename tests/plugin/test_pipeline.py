@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -79,7 +80,7 @@ def test_a_camera_is_found_by_its_image(build, whole, monkeypatch):
     with torch.no_grad():
         image = model.get_outputs_for_camera(camera)["rgb"].detach()
     moved = truth.clone()
-    moved[:, :3] = so3_exp(torch.tensor([0.012, -0.009, 0.015])) @ truth[:, :3]
+    moved[:, :3] = torch.from_numpy(so3_exp(np.array([0.012, -0.009, 0.015]))).float() @ truth[:, :3]
     moved[:, 3] += torch.tensor([0.03, -0.02, 0.02])
     start = Cameras(moved[None], fx=60.0, fy=60.0, cx=SIZE / 2, cy=SIZE / 2, width=SIZE, height=SIZE)
     found = refined_pose(model, start, {"image": image}, whole, torch.Generator().manual_seed(0))

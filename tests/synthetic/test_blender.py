@@ -7,7 +7,6 @@ from importlib.util import find_spec
 import cv2
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from kronc_ns.errors import KroncError
@@ -21,7 +20,6 @@ from kronc_ns.synthetic.render import trace_mask_and_depth
 from kronc_ns.synthetic.scenes import default_camera, make_capture
 
 needs_blender = pytest.mark.skipif(find_spec("bpy") is None, reason="Blender's module (bpy) is not installed")
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 CAMERA = Camera(150.0, 120.0, 70.0, 40.0, 128, 96)
 
 
@@ -47,16 +45,16 @@ def car(tmp_path_factory) -> MeshCar:
     return load_mesh_car(folder / "car.glb")
 
 
-def poses(*centres: tuple[float, float, float]) -> torch.Tensor:
-    at = torch.tensor(centres, dtype=torch.float64)
-    return look_at(at, torch.tensor([0.3, 0.2, 0.6], dtype=torch.float64).expand_as(at), UP)
+def poses(*centres: tuple[float, float, float]) -> np.ndarray:
+    at = np.array(centres, dtype=float)
+    return look_at(at, np.broadcast_to([0.3, 0.2, 0.6], at.shape), np.array([0.0, 0.0, 1.0]))
 
 
 @needs_blender
 def test_silhouettes_are_those_of_our_rays(car):
     """Also with oblong pixels and the principal point aside."""
     c2w = poses((4, 3, 2), (-5, 2, 1), (1, -5, 3))
-    for rgba, pose in zip(blender_views(car, c2w, CAMERA, ground=False), c2w.numpy(), strict=True):
+    for rgba, pose in zip(blender_views(car, c2w, CAMERA, ground=False), c2w, strict=True):
         mask, _ = trace_mask_and_depth(car.mesh, pose, CAMERA, ground=False)
         inside, covered = mask > 0, rgba[..., 3] > 127
         assert 0.05 < inside.mean() < 0.7

@@ -31,7 +31,7 @@ def rasterization(
     sh_degree: int | None = None,
     packed: bool = False,
     backgrounds: Float[Tensor, "c d"] | None = None,
-    render_mode: RenderMode = "RGB",
+    render_mode: RenderMode | str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",

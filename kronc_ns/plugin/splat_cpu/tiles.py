@@ -16,11 +16,11 @@ class TileLists:
 
     gaussians: Int[np.ndarray, " k"]
     """The Gaussians of tile 0, then of tile 1, ..., each list front to back."""
-    offsets: Int[np.ndarray, " t+1"]
-    """Where the list of each tile starts, and the end of the last."""
+    offsets: Int[np.ndarray, " t1"]
+    """Where the list of each of the T tiles starts, and the end of the last: T + 1 numbers."""
     order: Int[np.ndarray, " m"]
     """All Gaussians front to back."""
-    starts: Int[np.ndarray, " m+1"]
+    starts: Int[np.ndarray, " m1"]
     """The pairs of Gaussian ``order[i]`` are numbered ``starts[i]`` to ``starts[i + 1]``."""
     numbers: Int[np.ndarray, " k"]
     """The number, in that sense, of each pair in ``gaussians``."""

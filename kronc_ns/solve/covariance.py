@@ -1,0 +1,155 @@
+"""How well each camera is known relative to the points: covariance of a bundle adjustment without a fixed gauge.
+
+Relative means: no common shift, turn or growth of the points that are seen counts (inner constraints; docs/solver.md),
+so what remains is the camera's error relative to the object. Any generalised inverse will do, since the gauge is
+projected out; a stiff spring makes the matrix regular. A camera follows the points by -W^T Y, and the gauge's part of
+their error, motion G^T, is taken off it: with Z = Y L^-T and G = L^-1 gauge its covariance is
+W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from kronc_ns.solve import schur
+from kronc_ns.solve.compiled import compiled
+from kronc_ns.solve.linear import dot, factor, forward, inverse_factor
+from kronc_ns.solve.problem import Problem, State
+
+_TRACE = 1e-9  # of the gauge's directions, where points are too few to tell them apart
+_DAMPING = 1e-9  # keeps the gauge's zero pivots positive
+
+
+def camera_covariance(
+    problem: Problem, state: State, inlier: Bool[np.ndarray, "n j"], sigma_px: float, shape_weight: float
+) -> Float[np.ndarray, "n 6 6"]:
+    """Covariance of each camera's (rotation vector in radians, centre) in its own axes, the points held still.
+
+    Cameras without detections get what the system knows of them: nothing (a huge covariance).
+    """
+    chosen = Problem(
+        problem.uv,
+        np.where(inlier, problem.weight, 0.0),
+        problem.focal,
+        problem.shape,
+        refine=problem.refine,
+        points_known=problem.points_known,
+    )
+    data = schur.measured(chosen)
+    now, work = schur.estimate(data, state), schur.system(data, *problem.weight.shape, with_cameras=True)
+    covariance = np.empty((len(problem.weight), 6, 6))
+    schur.evaluate(data, now)
+    work.weight[:] = data.own
+    schur.reduce_system(data, now, work, _DAMPING, sigma_px**2 * shape_weight, sigma_px**2)
+    _covariances(data, now, work, sigma_px**2, covariance)
+    return covariance
+
+
+@compiled
+def _covariances(data: Any, now: Any, work: Any, variance: float, covariance: Any) -> None:
+    """Those of all cameras of a scene, from its reduced system."""
+    matrix = work.matrix
+    size = len(matrix)
+    gauge, inverse, mean = _gauge(now.points, data.joint, size)
+    stiffness = 0.0
+    for i in range(size):
+        stiffness += matrix[i, i] / size
+    for i in range(size):
+        for p in range(7):
+            part = stiffness * gauge[p, i]
+            for k in range(i + 1):
+                matrix[i, k] += part * gauge[p, k]
+    if not factor(matrix):
+        covariance[:] = np.nan
+        return
+    forward(matrix, gauge)
+    shared = np.empty((7, 7))
+    for p in range(7):
+        for q in range(7):
+            shared[p, q] = dot(gauge[p], gauge[q], size)
+    for n in range(len(now.rotation)):
+        z = work.whitened[n]
+        forward(matrix, z)
+        r, t, w = now.rotation[n], now.translation[n], work.whitener[n]
+        _camera_covariance(r, t, mean, w, z, gauge, shared, inverse, variance, covariance[n])
+
+
+@compiled
+def _gauge(points: Any, joint: Any, size: int) -> Any:
+    """Orthonormal directions [12, P] in which shift, turn and growth of the world move the points that are seen.
+
+    (The last five are 0, for `forward`.) Also the 7x7 matrix that makes them of the moves, and the points' mean.
+    """
+    joints = len(points)
+    moves, square, inverse, mean = np.zeros((12, size)), np.empty((7, 7)), np.empty((7, 7)), np.zeros(3)
+    seen, count = np.zeros(joints), 0.0
+    for j in joint:
+        count += 1.0 - seen[j]
+        seen[j] = 1.0
+    for j in range(joints):
+        for c in range(3):
+            mean[c] += seen[j] * points[j, c] / max(count, 1.0)
+    for j in range(joints):
+        if seen[j] > 0.0:
+            x, y, z = points[j, 0] - mean[0], points[j, 1] - mean[1], points[j, 2] - mean[2]
+            for c in range(3):
+                moves[c, c * joints + j] = 1.0
+            moves[3, joints + j], moves[3, 2 * joints + j] = -z, y
+            moves[4, j], moves[4, 2 * joints + j] = z, -x
+            moves[5, j], moves[5, joints + j] = -y, x
+            moves[6, j], moves[6, joints + j], moves[6, 2 * joints + j] = x, y, z
+    for p in range(7):
+        for q in range(7):
+            square[p, q] = dot(moves[p], moves[q], size)
+        square[p, p] += _TRACE
+    inverse_factor(square, inverse)
+    for p in range(6, -1, -1):
+        for i in range(size):
+            moves[p, i] *= inverse[p, p]
+        for q in range(p):
+            for i in range(size):
+                moves[p, i] += inverse[p, q] * moves[q, i]
+    return moves, inverse, mean
+
+
+@compiled
+def _camera_covariance(
+    r: Any, t: Any, mean: Any, whitener: Any, z: Any, gauge: Any, shared: Any, inverse: Any, variance: Any,
+    out: Any,
+) -> None:  # fmt: skip
+    """One camera's, with what moving the world does to it (motion): when it shifts by s, turns by w and grows by g
+    about the mean m, then with a = R m + t the camera turns by -R w and moves by g a - [a] R w - R s in its own axes.
+    """
+    size = gauge.shape[1]
+    moved, outer, inner, half = np.zeros((6, 7)), np.zeros((6, 13)), np.zeros((13, 13)), np.empty((6, 13))
+    at = np.empty(3)
+    for p in range(3):
+        at[p] = r[p, 0] * mean[0] + r[p, 1] * mean[1] + r[p, 2] * mean[2] + t[p]
+    for p in range(3):
+        a, b = (p + 1) % 3, (p + 2) % 3
+        for c in range(3):
+            moved[p, 3 + c] = -r[p, c]
+            moved[3 + p, c] = -r[p, c]
+            moved[3 + p, 3 + c] = at[b] * r[a, c] - at[a] * r[b, c]
+        moved[3 + p, 6] = at[p]
+    for p in range(6):
+        for q in range(6):
+            outer[p, q] = whitener[q, p]
+            inner[p, q] = dot(z[p], z[q], size)
+        inner[p, p] += 1.0
+        for q in range(7):
+            inner[p, 6 + q] = inner[6 + q, p] = dot(z[p], gauge[q], size)
+            for k in range(q + 1):
+                outer[p, 6 + q] += moved[p, k] * inverse[q, k]
+    for p in range(7):
+        for q in range(7):
+            inner[6 + p, 6 + q] = shared[p, q]
+    for p in range(6):
+        for q in range(13):
+            half[p, q] = dot(outer[p], inner[q], 13)
+    for p in range(6):
+        for q in range(6):
+            # the centre moves by -v (in camera axes) when the translation grows by v
+            sign = -1.0 if (p < 3) != (q < 3) else 1.0
+            out[p, q] = sign * variance * dot(half[p], outer[q], 13)

@@ -1,0 +1,425 @@
+"""One step of bundle adjustment with the cameras eliminated, compiled for the CPU.
+
+Only the system of the P other unknowns is factorised: the points' coordinates (3J, or none where they are known) and K
+refined intrinsics; so the cost grows linearly with the views. Nothing fixes the gauge. The detections of a scene stand
+in a row, view by view: those of view n are ``first[n]:first[n + 1]``. Derivation: docs/solver.md.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kronc_ns.solve.compiled import compiled
+from kronc_ns.solve.linear import dot, exponential, inverse_factor, solve
+from kronc_ns.solve.problem import Problem, State
+from kronc_ns.solve.projection import (
+    BEHIND_PX,
+    NEAR,
+    pixel,
+    pixel_by_k1,
+    pixel_by_plane,
+    plane_by_point,
+    plane_by_shift,
+    plane_by_turn,
+)
+from kronc_ns.solve.robust import cost, shape_excess, shape_weight, weigh
+
+Array = NDArray[Any]
+
+TINY = 1e-12
+"""Diagonal entries up to this say nothing; their unknowns stay where they are."""
+
+
+class Measured(NamedTuple):
+    """A `Problem` as compiled loops take it: K detections in a row, priors of length 0 where there are none."""
+
+    first: Array
+    """[N + 1]"""
+    joint: Array
+    """[K] which point"""
+    uv: Array
+    """[K, 2]"""
+    own: Array
+    """[K] weight"""
+    focal: Array
+    """[2]"""
+    mean: Array
+    """[3J] of the shape prior"""
+    precision: Array
+    """[3J, 3J]"""
+    freedom: float
+    centre: Array
+    """[N, 3] expected camera centres"""
+    strength: Array
+    """[N] their inverse variance"""
+    points_known: bool
+    with_focal: bool
+    with_k1: bool
+
+
+class Estimate(NamedTuple):
+    """The unknowns, and what follows from them."""
+
+    rotation: Array
+    """[N, 3, 3] world to camera"""
+    translation: Array
+    """[N, 3]"""
+    points: Array
+    """[J, 3]"""
+    intrinsics: Array
+    """[2]: logarithm of the focal length's factor, k1"""
+    seen: Array
+    """[K, 3]: place in the image plane, 1 / z"""
+    error: Array
+    """[K, 2]: projection minus detection in pixels; 0 behind the camera"""
+    length: Array
+    """[K]: its weighted length; `BEHIND_PX` behind the camera"""
+    pull: Array
+    """[3J] half the gradient of the surprise"""
+    surprise: Array
+    """[1]: squared Mahalanobis distance of the points under the shape prior"""
+
+
+class System(NamedTuple):
+    """Room for the reduced system, and what is needed to get back to the cameras."""
+
+    weight: Array
+    """[K] IRLS weights times the detections' own"""
+    order: Array
+    """[K] scratch"""
+    whitener: Array
+    """[N, 6, 6]: inverse Cholesky factors of the cameras' blocks"""
+    whitened: Array
+    """[N, 6, P + 1], zeros: cameras against other unknowns, and their gradient; [0, ...] if not wanted"""
+    matrix: Array
+    """[P, P], lower triangle"""
+    rhs: Array
+    """[P]; the change of the unknowns, once solved"""
+
+
+def measured(problem: Problem) -> Measured:
+    """A problem with its detections in a row."""
+    view, joint = np.nonzero(problem.weight > 0)
+    views = len(problem.weight)
+    first = np.zeros(views + 1, np.int64)
+    np.cumsum(np.bincount(view, minlength=views), out=first[1:])
+    shape, orbit = problem.shape, problem.orbit
+    return Measured(
+        first,
+        joint,
+        problem.uv[view, joint],
+        problem.weight[view, joint],
+        np.array(problem.focal),
+        np.empty(0) if shape is None else shape.mean,
+        np.empty((0, 0)) if shape is None else shape.precision,
+        1.0 if shape is None else shape.freedom,
+        np.empty((0, 3)) if orbit is None else orbit.centre,
+        np.empty(0) if orbit is None else 1.0 / np.square(orbit.sigma),
+        problem.points_known,
+        "focal" in problem.refine,
+        "k1" in problem.refine,
+    )
+
+
+def estimate(data: Measured, state: State) -> Estimate:
+    """Room for an estimate, at a state."""
+    count = len(data.joint)
+    return Estimate(
+        np.array(state.rotation),
+        np.array(state.translation),
+        np.array(state.points),
+        np.array([state.log_growth, state.k1]),
+        np.empty((count, 3)),
+        np.empty((count, 2)),
+        np.empty(count),
+        np.zeros(state.points.size),
+        np.zeros(1),
+    )
+
+
+def system(data: Measured, views: int, joints: int, with_cameras: bool = False) -> System:
+    """Room for the system of a problem; ``with_cameras`` where the cameras' rows are wanted, too."""
+    size = (0 if data.points_known else 3 * joints) + data.with_focal + data.with_k1
+    return System(
+        np.empty(len(data.joint)),
+        np.empty(len(data.joint)),
+        np.empty((views, 6, 6)),
+        np.zeros((views if with_cameras else 0, 6, size + 1)),
+        np.empty((size, size)),
+        np.empty(size),
+    )
+
+
+@compiled
+def evaluate(data: Measured, now: Estimate) -> None:
+    """Reproject all points, and see how unusual they are: everything in ``now`` that follows from its unknowns."""
+    growth, k1 = np.exp(now.intrinsics[0]), now.intrinsics[1]
+    fx, fy = data.focal[0] * growth, data.focal[1] * growth
+    for n in range(len(now.rotation)):
+        r, t = now.rotation[n], now.translation[n]
+        for k in range(data.first[n], data.first[n + 1]):
+            j = data.joint[k]
+            x, y, z = now.points[j, 0], now.points[j, 1], now.points[j, 2]
+            depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
+            near = 1.0 / max(depth, NEAR)
+            u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) * near
+            v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) * near
+            now.seen[k, 0], now.seen[k, 1], now.seen[k, 2] = u, v, near
+            now.error[k, 0] = now.error[k, 1] = 0.0
+            now.length[k] = BEHIND_PX
+            if not depth < NEAR:
+                px, py = pixel(u, v, fx, fy, k1)
+                dx, dy = px - data.uv[k, 0], py - data.uv[k, 1]
+                now.error[k, 0], now.error[k, 1] = dx, dy
+                now.length[k] = np.sqrt(data.own[k] * (dx * dx + dy * dy))
+    if len(data.mean) and not data.points_known:
+        joints, total = len(now.points), 0.0
+        deviation = np.empty(3 * joints)
+        for c in range(3):
+            for j in range(joints):
+                deviation[c * joints + j] = now.points[j, c] - data.mean[c * joints + j]
+        for i in range(3 * joints):
+            now.pull[i] = dot(data.precision[i], deviation, 3 * joints)
+            total += now.pull[i] * deviation[i]
+        now.surprise[0] = total
+
+
+@compiled
+def total_cost(data: Measured, now: Estimate, sigma: float, phase: int) -> Any:
+    """What is minimised, in squared pixels: detections and priors."""
+    total = cost(now.length, sigma, phase)
+    if len(data.mean) and not data.points_known:
+        size = len(data.mean)
+        usual, rest = shape_excess(now.surprise[0], data.freedom, size)
+        total += sigma * sigma * (usual + (data.freedom + size) * np.log(rest))
+    for n in range(len(data.strength)):
+        square = 0.0
+        for c in range(3):
+            off = orbit_error(data, now, n, c)
+            square += off * off
+        total += sigma * sigma * data.strength[n] * square
+    return total
+
+
+@compiled
+def orbit_error(data: Measured, now: Estimate, n: int, c: int) -> Any:
+    """Expected minus present centre of camera n along its axis c (it grows with the translation)."""
+    r, centre = now.rotation[n], data.centre[n]
+    return now.translation[n, c] + r[c, 0] * centre[0] + r[c, 1] * centre[1] + r[c, 2] * centre[2]
+
+
+def propose(
+    data: Measured, now: Estimate, trial: Estimate, work: System, sigma: float, phase: int, damping: float
+) -> float:
+    """Cost of ``trial``, one damped step ahead of ``now``; NaN where there is no step.
+
+    In Python, since a compiled caller would be compiled together with all that it calls.
+    """
+    weigh(now.length, data.own, sigma, phase, work.weight)
+    belief = 0.0
+    if len(data.mean):
+        belief = sigma * sigma * shape_weight(float(now.surprise[0]), data.freedom, len(data.mean))
+    reduce_system(data, now, work, damping, belief, sigma * sigma)
+    if not step(data, now, trial, work, sigma * sigma):
+        return math.nan
+    evaluate(data, trial)
+    return total_cost(data, trial, sigma, phase)
+
+
+@compiled
+def reduce_system(data: Measured, now: Estimate, work: System, damping: float, belief: float, variance: float) -> None:
+    """Normal equations and Schur complement of the cameras in one pass over the detections.
+
+    ``work.weight`` is given; ``belief`` is the weight of the shape prior, ``variance`` that of expected centres.
+    """
+    matrix, rhs = work.matrix, work.rhs
+    size, joints = len(rhs), len(now.points)
+    shared = int(data.with_focal) + int(data.with_k1)
+    points = size - shared
+    most = 0
+    for n in range(len(now.rotation)):
+        most = max(most, data.first[n + 1] - data.first[n])
+    a, rows, off = np.empty((6, 2 * most)), np.empty((3, 2 * most)), np.empty(2 * most)
+    lens, camera, right = np.empty((2, 2 * most)), np.empty((6, 6)), np.empty(6)
+    widest = 3 * most + shared
+    columns = np.empty(widest, np.uint64)  # unsigned: else every access asks whether it counts from the end
+    mixed, y, dots = np.empty((6, widest)), np.empty((6, widest)), np.empty((2, widest))
+    diagonal = np.empty(size)
+    with_prior = len(data.precision) > 0 and points > 0
+    for i in range(size):
+        for k in range(i + 1):
+            matrix[i, k] = belief * data.precision[i, k] if with_prior and i < points else 0.0
+        rhs[i] = -belief * now.pull[i] if with_prior and i < points else 0.0
+        diagonal[i] = matrix[i, i]
+    for n in range(len(now.rotation)):
+        begin, count = data.first[n], data.first[n + 1] - data.first[n]
+        fill_rows(data, now, work.weight, n, a, rows, off, lens)
+        for p in range(6):
+            right[p] = dot(a[p], off, 2 * count)
+            for q in range(p + 1):
+                camera[p, q] = dot(a[p], a[q], 2 * count)
+        if len(data.strength):
+            for c in range(3):
+                camera[3 + c, 3 + c] += variance * data.strength[n]
+                right[3 + c] += variance * data.strength[n] * orbit_error(data, now, n, c)
+        for p in range(6):
+            camera[p, p] = damped(camera[p, p], damping)
+        w = work.whitener[n]
+        inverse_factor(camera, w)
+        width = 3 * count if points else 0
+        if width:
+            for c in range(3):
+                for k in range(count):
+                    columns[c * count + k] = c * joints + data.joint[begin + k]
+                for p in range(6):
+                    into = mixed[p, c * count :]
+                    for k in range(count):
+                        into[k] = a[p, k] * rows[c, k] + a[p, count + k] * rows[c, count + k]
+                for k in range(count):
+                    i = columns[c * count + k]
+                    rhs[i] -= rows[c, k] * off[k] + rows[c, count + k] * off[count + k]
+                    diagonal[i] += rows[c, k] * rows[c, k] + rows[c, count + k] * rows[c, count + k]
+                    for d in range(c + 1):
+                        square = rows[c, k] * rows[d, k] + rows[c, count + k] * rows[d, count + k]
+                        matrix[i, columns[d * count + k]] += square
+        for s in range(shared):
+            row, i = lens[s], points + s
+            columns[width + s] = i
+            rhs[i] -= dot(row, off, 2 * count)
+            for p in range(6):
+                mixed[p, width + s] = dot(a[p], row, 2 * count)
+            for c in range(3 if width else 0):
+                for k in range(count):
+                    product = rows[c, k] * row[k] + rows[c, count + k] * row[count + k]
+                    matrix[i, columns[c * count + k]] += product
+            for d in range(s + 1):
+                matrix[i, points + d] += dot(row, lens[d], 2 * count)
+            diagonal[i] += dot(row, row, 2 * count)
+        width += shared
+        for p in range(6):
+            for i in range(width):
+                y[p, i] = 0.0
+            total = 0.0
+            for q in range(p + 1):
+                part = w[p, q]
+                total += part * right[q]
+                for i in range(width):
+                    y[p, i] += part * mixed[q, i]
+            for i in range(width):
+                rhs[columns[i]] += y[p, i] * total
+            if n < len(work.whitened):
+                work.whitened[n, p, size] = total
+                for i in range(width):
+                    work.whitened[n, p, columns[i]] = y[p, i]
+        # two rows at a time share the loads; the last row of an odd width is computed twice
+        for i in range(0, width, 2):
+            m = min(i + 1, width - 1)
+            y0, y1, y2, y3, y4, y5 = y[0, i], y[1, i], y[2, i], y[3, i], y[4, i], y[5, i]
+            z0, z1, z2, z3, z4, z5 = y[0, m], y[1, m], y[2, m], y[3, m], y[4, m], y[5, m]
+            for k in range(m + 1):
+                x0, x1, x2, x3, x4, x5 = y[0, k], y[1, k], y[2, k], y[3, k], y[4, k], y[5, k]
+                dots[0, k] = y0 * x0 + y1 * x1 + y2 * x2 + y3 * x3 + y4 * x4 + y5 * x5
+                dots[1, k] = z0 * x0 + z1 * x1 + z2 * x2 + z3 * x3 + z4 * x4 + z5 * x5
+            upper, lower = matrix[columns[i]], matrix[columns[m]]
+            for k in range(i + 1):
+                upper[columns[k]] -= dots[0, k]
+            if m > i:
+                for k in range(m + 1):
+                    lower[columns[k]] -= dots[1, k]
+    for i in range(size):
+        matrix[i, i] += damped(diagonal[i], damping) - diagonal[i]
+
+
+@compiled
+def step(data: Measured, now: Estimate, to: Estimate, work: System, variance: float) -> Any:
+    """Solve for the other unknowns, then each camera; False where the system is not positive definite."""
+    if not solve(work.matrix, work.rhs):
+        return False
+    most = 0
+    for n in range(len(now.rotation)):
+        most = max(most, data.first[n + 1] - data.first[n])
+    a, rows, off = np.empty((6, 2 * most)), np.empty((3, 2 * most)), np.empty(2 * most)
+    lens, right, twist, turn = np.empty((2, 2 * most)), np.empty(6), np.empty(6), np.empty((3, 3))
+    change, joints = work.rhs, len(now.points)
+    points = 0 if data.points_known else 3 * joints
+    shared = int(data.with_focal) + int(data.with_k1)
+    for j in range(joints):
+        for c in range(3):
+            to.points[j, c] = now.points[j, c] + (change[c * joints + j] if points else 0.0)
+    to.intrinsics[0], to.intrinsics[1] = now.intrinsics[0], now.intrinsics[1]
+    for s in range(shared):
+        to.intrinsics[0 if data.with_focal and s == 0 else 1] += change[points + s]
+    for n in range(len(now.rotation)):
+        r, t, w = now.rotation[n], now.translation[n], work.whitener[n]
+        begin, count = data.first[n], data.first[n + 1] - data.first[n]
+        fill_rows(data, now, work.weight, n, a, rows, off, lens)
+        if points:
+            for k in range(count):
+                for c in range(3):
+                    moved = change[c * joints + data.joint[begin + k]]
+                    off[k] += rows[c, k] * moved
+                    off[count + k] += rows[c, count + k] * moved
+        for s in range(shared):
+            for k in range(2 * count):
+                off[k] += lens[s, k] * change[points + s]
+        for p in range(6):
+            right[p] = dot(a[p], off, 2 * count)
+        if len(data.strength):
+            for c in range(3):
+                right[3 + c] += variance * data.strength[n] * orbit_error(data, now, n, c)
+        for p in range(6):
+            twist[p] = total = 0.0
+            for q in range(p + 1):
+                total += w[p, q] * right[q]
+            for q in range(p + 1):
+                twist[q] -= w[p, q] * total
+        exponential(twist, turn)
+        for p in range(3):
+            to.translation[n, p] = turn[p, 0] * t[0] + turn[p, 1] * t[1] + turn[p, 2] * t[2] + twist[3 + p]
+            for c in range(3):
+                to.rotation[n, p, c] = turn[p, 0] * r[0, c] + turn[p, 1] * r[1, c] + turn[p, 2] * r[2, c]
+    return True
+
+
+@compiled
+def fill_rows(data: Measured, now: Estimate, weight: Any, n: int, a: Any, rows: Any, off: Any, lens: Any) -> None:
+    """Derivatives of view n's weighted projections, along x and then along y, and the errors themselves.
+
+    By the camera a [6, 2 count], by the point rows [3, 2 count], by the refined intrinsics lens [K, 2 count];
+    off [2 count].
+    """
+    growth, k1, r = np.exp(now.intrinsics[0]), now.intrinsics[1], now.rotation[n]
+    fx, fy = data.focal[0] * growth, data.focal[1] * growth
+    begin, count = data.first[n], data.first[n + 1] - data.first[n]
+    for k in range(count):
+        at, m = begin + k, count + k
+        u, v, near, root = now.seen[at, 0], now.seen[at, 1], now.seen[at, 2], np.sqrt(weight[at])
+        xu, xv, yu, yv = pixel_by_plane(u, v, root * fx, root * fy, k1)
+        u0, u1, u2, v0, v1, v2 = plane_by_turn(u, v)
+        ux, uz, vy, vz = plane_by_shift(u, v, near)
+        a[0, k], a[1, k], a[2, k] = xu * u0 + xv * v0, xu * u1 + xv * v1, xu * u2 + xv * v2
+        a[3, k], a[4, k], a[5, k] = xu * ux, xv * vy, xu * uz + xv * vz
+        a[0, m], a[1, m], a[2, m] = yu * u0 + yv * v0, yu * u1 + yv * v1, yu * u2 + yv * v2
+        a[3, m], a[4, m], a[5, m] = yu * ux, yv * vy, yu * uz + yv * vz
+        off[k], off[m] = root * now.error[at, 0], root * now.error[at, 1]
+        for c in range(3):
+            du, dv = plane_by_point(u, v, near, r[0, c], r[1, c], r[2, c])
+            rows[c, k] = xu * du + xv * dv
+            rows[c, m] = yu * du + yv * dv
+    if data.with_focal or data.with_k1:
+        for k in range(count):
+            at, m, s = begin + k, count + k, 0
+            u, v, root = now.seen[at, 0], now.seen[at, 1], np.sqrt(weight[at])
+            if data.with_focal:
+                lens[0, k], lens[0, m] = pixel(u, v, root * fx, root * fy, k1)
+                s = 1
+            if data.with_k1:
+                lens[s, k], lens[s, m] = pixel_by_k1(u, v, root * fx, root * fy)
+
+
+@compiled
+def damped(entry: Any, damping: Any) -> Any:
+    """A diagonal entry with Marquardt's damping, kept off zero."""
+    return (1.0 + damping) * (1.0 if entry <= TINY else entry)
