@@ -33,7 +33,9 @@ class Attempt:
     sigma_px: float
     shape_weight: float
     """1 for a usual car, towards 0 the less it looks like one."""
-    covariance: Float[np.ndarray, "n 6 6"]
+    problem: Problem
+    state: State
+    """What was solved last, and where it ended, in the solver's gauge."""
     iterations: int
     converged: bool
     history: dict[str, list[float]]
@@ -41,6 +43,12 @@ class Attempt:
     """Poses at steps on the way, in the gauge of the solver."""
     choice: str = ""
     """Why this start was preferred to others."""
+
+    def covariance(self) -> Float[np.ndarray, "n 6 6"]:
+        """Of each camera (`camera_covariance`); NaN where nothing agrees."""
+        if not self.inlier.any():
+            return np.full((len(self.inlier), 6, 6), math.nan)
+        return camera_covariance(self.problem, self.state, self.inlier, self.sigma_px, self.shape_weight)
 
     @property
     def agreeing(self) -> Bool[np.ndarray, "n"]:
@@ -102,7 +110,8 @@ def _attempt(start: Hypothesis, found: Hypothesis, problem: Problem, result: LmR
         inlier=result.inlier,
         sigma_px=result.sigma_px,
         shape_weight=result.shape_weight,
-        covariance=camera_covariance(problem, result.state, result.inlier, result.sigma_px, result.shape_weight),
+        problem=problem,
+        state=result.state,
         iterations=len(result.loss),
         converged=result.converged,
         history={"step": [float(step) for step in range(1, len(result.loss) + 1)], "loss": list(result.loss)},
@@ -151,12 +160,20 @@ def measured(
     error = np.where(counted, found.error_px, math.inf)
     sigma_px = noise_px(error[np.isfinite(error)])
     inlier = error <= INLIER_SIGMAS * sigma_px
-    covariance = np.full((len(scene), 6, 6), math.nan)
-    if inlier.any():
-        points = np.where(np.isfinite(found.points), found.points, 0.0)
-        problem = problem_of(found, with_prior=False)
-        covariance = camera_covariance(problem, State.of(_posed(found), points), inlier, sigma_px, 1.0)
-    return Attempt(start, found, inlier, sigma_px, 1.0, covariance, iterations, True, history, path)
+    points = np.where(np.isfinite(found.points), found.points, 0.0)
+    return Attempt(
+        start=start,
+        found=found,
+        inlier=inlier,
+        sigma_px=sigma_px,
+        shape_weight=1.0,
+        problem=problem_of(found, with_prior=False),
+        state=State.of(_posed(found), points),
+        iterations=iterations,
+        converged=True,
+        history=history,
+        path=path,
+    )
 
 
 def misfit(attempt: Attempt) -> float:

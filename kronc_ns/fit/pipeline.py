@@ -245,7 +245,7 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig, seconds: float)
     enough = 2 if int(took_part.sum()) >= 2 else 1
     points = np.where((attempt.inlier.sum(0) >= enough)[:, None], found.points, math.nan)
     placement = _placement(scene, attempt, points, took_part, config)
-    variance = np.diagonal(attempt.covariance, axis1=-2, axis2=-1)
+    variance = np.diagonal(attempt.covariance(), axis1=-2, axis2=-1)
     evidence = Evidence(
         camera=found.scene.camera,
         c2w=np.where(took_part[:, None, None], placement.apply_to_poses(found.c2w), math.nan),

@@ -52,15 +52,17 @@ class Hypothesis:
     @cached_property
     def error_px(self) -> Float[np.ndarray, "n j"]:
         """Distance of every detection from its point; inf behind a camera and where either has no place."""
-        error = np.linalg.norm(reproject(self.points, self.c2w, self.scene.camera) - self.scene.uv, axis=-1)
+        off = reproject(self.points, self.c2w, self.scene.camera) - self.scene.uv
+        error = np.hypot(off[..., 0], off[..., 1])
         return np.where(np.isnan(error), np.inf, error)
 
     @cached_property
     def far_side(self) -> Bool[np.ndarray, "n j"]:
         """Whether each point looks away from each camera; never, where the schema has no template."""
-        ray = self.c2w[:, None, :, 3] - self.points
-        facing = np.einsum("njc,jc->nj", ray, normals(self.scene))
-        return facing < AWAY * np.linalg.norm(ray, axis=-1)
+        centre, points, outward = self.c2w[..., 3], self.points, normals(self.scene)
+        facing = centre @ outward.T - (points * outward).sum(1)
+        distance = (centre**2).sum(1)[:, None] - 2 * centre @ points.T + (points**2).sum(1)
+        return facing < AWAY * np.sqrt(np.maximum(distance, 0.0))
 
 
 def normals(scene: Scene) -> Float[np.ndarray, "j 3"]:

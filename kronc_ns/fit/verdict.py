@@ -76,7 +76,8 @@ def residuals_px(
     scene: Scene, camera: Camera, c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, "n j"]:
     """Reprojection error of every detection against the solved points; NaN where there is none, inf behind a camera."""
-    error = np.linalg.norm(reproject(points, c2w, camera) - scene.uv, axis=-1)
+    off = reproject(points, c2w, camera) - scene.uv
+    error = np.hypot(off[..., 0], off[..., 1])
     return np.where(scene.seen & posed(c2w)[:, None] & np.isfinite(points).all(-1), error, math.nan)
 
 
@@ -192,12 +193,13 @@ def _all_alike(scene: Scene, solved: Bool[np.ndarray, "n"]) -> bool:
     chosen = np.flatnonzero(solved)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLED_VIEWS)).astype(int)]
     seen = scene.seen[chosen]
-    shared = seen.sum(0) > 1
-    if not shared.any():
+    seen = seen & (seen.sum(0) > 1)
+    if not seen.any():
         return False
-    uv = np.where(seen[..., None], scene.uv[chosen], math.nan)[:, shared]
-    off = np.linalg.norm(uv - np.nanmedian(uv, axis=0), axis=-1)
-    return float(np.nanmedian(off)) < _ALIKE * _diagonal(scene)
+    uv = np.where(seen[..., None], scene.uv[chosen], math.inf)
+    middle = np.sort(uv, axis=0)[np.maximum(seen.sum(0) - 1, 0) // 2, np.arange(seen.shape[1])]
+    off = (uv - middle)[seen]
+    return float(np.median(np.hypot(off[:, 0], off[:, 1]))) < _ALIKE * _diagonal(scene)
 
 
 def _diagonal(scene: Scene) -> float:

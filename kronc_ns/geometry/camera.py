@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from kronc_ns.errors import KroncError
-from kronc_ns.geometry.poses import invert, transform
+from kronc_ns.geometry.poses import invert
 
 
 @dataclass(frozen=True)
@@ -108,5 +108,9 @@ def reproject(
     points: Float[np.ndarray, "j 3"], c2w: Float[np.ndarray, "n 3 4"], camera: Camera
 ) -> Float[np.ndarray, "n j 2"]:
     """Pixels of every point in every view (the paper's equation 3 of its centroids); inf behind a camera."""
-    in_camera = transform(invert(c2w), np.broadcast_to(points, (len(c2w), *points.shape)))
-    return np.where(in_camera[..., 2:] > 0, project(in_camera, camera), np.inf)
+    w2c = invert(c2w)
+    x, y, z = (w2c[:, axis, :3] @ points.T + w2c[:, axis, 3:] for axis in range(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
+    pixels[~(z > 0)] = np.inf
+    return pixels

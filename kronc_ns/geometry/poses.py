@@ -37,7 +37,7 @@ def transform(pose: Float[np.ndarray, "*b 3 4"], points: Float[np.ndarray, "*b n
 
 def posed(c2w: Float[np.ndarray, "*n 3 4"]) -> Bool[np.ndarray, "*n"]:
     """Which views have a pose (the others hold NaN)."""
-    return np.isfinite(c2w).all((-2, -1))
+    return np.asarray(np.isfinite(c2w).all((-2, -1)))
 
 
 def camera_z(c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "n j"]:
@@ -48,7 +48,8 @@ def camera_z(c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"]) 
 
 def unit(vector: Float[np.ndarray, "*b k"]) -> Float[np.ndarray, "*b k"]:
     """Vectors at length 1; zero stays zero."""
-    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12)
+    square = np.einsum("...i,...i->...", vector, vector)  # several times faster than a norm over three entries
+    return vector / np.maximum(np.sqrt(square), 1e-12)[..., None]
 
 
 def look_at(

@@ -6,12 +6,10 @@ Images are [h, w, 3] in [0, 1]; a mask is True on the vehicle.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+import numpy as np
+from jaxtyping import Bool, Float, Float32
 
-Lpips = Callable[[Float[Tensor, "1 3 h w"], Float[Tensor, "1 3 h w"]], Tensor]
+Lpips = Callable[[Float32[np.ndarray, "1 3 h w"], Float32[np.ndarray, "1 3 h w"]], float]
 """Learned perceptual distance of two images in [0, 1], with genuine weights (Zhang et al. 2018)."""
 
 
@@ -28,20 +26,17 @@ class ImageMetrics:
 
 
 def frame_metrics(
-    rendered: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], lpips: Lpips | None = None
+    rendered: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"], lpips: Lpips | None = None
 ) -> ImageMetrics:
     """Metrics of the full frame, the same for every method (nerfstudio's methods compute SSIM in different ways)."""
-    psnr = peak_signal_noise_ratio(rendered, truth, data_range=1.0)
-    ssim = structural_similarity_index_measure(_batch(rendered), _batch(truth), data_range=1.0)
-    assert isinstance(ssim, Tensor)
-    distance = None if lpips is None else float(lpips(_batch(rendered), _batch(truth)))
-    return ImageMetrics(float(psnr), float(ssim), distance)
+    distance = None if lpips is None else lpips(_batch(rendered), _batch(truth))
+    return ImageMetrics(_psnr(rendered, truth), float(_similarity(rendered, truth).mean()), distance)
 
 
 def vehicle_metrics(
-    rendered: Float[Tensor, "h w 3"],
-    truth: Float[Tensor, "h w 3"],
-    mask: Bool[Tensor, "h w"],
+    rendered: Float[np.ndarray, "h w 3"],
+    truth: Float[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
     lpips: Lpips | None = None,
 ) -> ImageMetrics | None:
     """Metrics of the vehicle's pixels alone; None where the mask is empty.
@@ -51,15 +46,11 @@ def vehicle_metrics(
     """
     if not mask.any():
         return None
-    psnr = peak_signal_noise_ratio(rendered[mask], truth[mask], data_range=1.0)
-    _, similarity = structural_similarity_index_measure(
-        _batch(rendered), _batch(truth), data_range=1.0, return_full_image=True
-    )
     distance = None
     if lpips is not None:
-        alone = [_batch(torch.where(mask[..., None], image, 1.0)) for image in (rendered, truth)]
-        distance = float(lpips(*alone))
-    return ImageMetrics(float(psnr), float(similarity[0].mean(0)[mask].mean()), distance)
+        distance = lpips(*(_batch(np.where(mask[..., None], image, 1)) for image in (rendered, truth)))
+    similarity = float(_similarity(rendered, truth)[mask].mean())
+    return ImageMetrics(_psnr(rendered[mask], truth[mask]), similarity, distance)
 
 
 def mean_metrics(images: Sequence[ImageMetrics]) -> ImageMetrics:
@@ -76,5 +67,20 @@ def mean_metrics(images: Sequence[ImageMetrics]) -> ImageMetrics:
     )
 
 
-def _batch(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
-    return image.movedim(-1, 0)[None]
+def _psnr(rendered: Float[np.ndarray, "*b 3"], truth: Float[np.ndarray, "*b 3"]) -> float:
+    with np.errstate(divide="ignore"):
+        return float(-10 * np.log10(np.square(rendered - truth, dtype=np.float64).mean()))
+
+
+def _similarity(rendered: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """SSIM of the window about each pixel, mean over the channels."""
+    import torch
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    images = [torch.from_numpy(_batch(image)) for image in (rendered, truth)]
+    _, similarity = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
+    return similarity[0].mean(0).numpy()
+
+
+def _batch(image: Float[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "1 3 h w"]:
+    return np.ascontiguousarray(np.moveaxis(image, -1, 0)[None], dtype=np.float32)

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
 
-import torch
+import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.alignment import pose_errors
@@ -21,10 +20,10 @@ class PoseErrors:
 
     views: int
     """Views of the reference."""
-    rotation_deg: Float[Tensor, "n"]
-    translation: Float[Tensor, "n"]
+    rotation_deg: Float[np.ndarray, "n"]
+    translation: Float[np.ndarray, "n"]
     """Distance of camera centres in the reference's unit."""
-    angle_deg: Float[Tensor, "n"]
+    angle_deg: Float[np.ndarray, "n"]
     """Larger of rotation error and the angle the centre error subtends at the centre of the reference cameras."""
 
     @property
@@ -34,7 +33,7 @@ class PoseErrors:
 
     def auc(self, limit_deg: float) -> float:
         """Area under the recall curve of `angle_deg` from 0 to ``limit_deg``, in [0, 1]; missing views never count."""
-        within = (1 - self.angle_deg / limit_deg).clamp_min(0)
+        within = np.maximum(1 - self.angle_deg / limit_deg, 0)
         return float(within.sum() / self.views)
 
     def as_dict(self) -> dict[str, Any]:
@@ -49,7 +48,7 @@ class PoseErrors:
 
 
 def evaluate_poses(
-    poses: Mapping[str, Float[Tensor, "3 4"]], reference: Mapping[str, Float[Tensor, "3 4"]]
+    poses: Mapping[str, Float[np.ndarray, "3 4"]], reference: Mapping[str, Float[np.ndarray, "3 4"]]
 ) -> PoseErrors:
     """Compare poses (OpenCV c2w by image path) with a reference; views are matched by file name.
 
@@ -63,20 +62,19 @@ def evaluate_poses(
             f"{len(common)} of {len(theirs)} reference views are among the {len(ours)} poses: expected at least 3 with "
             "equal file names"
         )
-    estimate = torch.stack([ours[name] for name in common]).double()
-    truth = torch.stack([theirs[name] for name in common]).double()
+    estimate, truth = (np.stack([poses_of[name] for name in common]) for poses_of in (ours, theirs))
     rotation, translation = pose_errors(estimate, truth)
-    distance = (truth[..., 3] - truth[..., 3].mean(0)).norm(dim=-1).clamp_min(1e-12)
-    angle = torch.maximum(rotation, torch.rad2deg(torch.atan2(translation, distance)))
+    distance = np.linalg.norm(truth[..., 3] - truth[..., 3].mean(0), axis=-1)
+    angle = np.maximum(rotation, np.rad2deg(np.arctan2(translation, distance)))
     return PoseErrors(len(theirs), rotation, translation, angle)
 
 
-def _by_file_name(poses: Mapping[str, Float[Tensor, "3 4"]], what: str) -> dict[str, Tensor]:
+def _by_file_name(poses: Mapping[str, Float[np.ndarray, "3 4"]], what: str) -> dict[str, Float[np.ndarray, "3 4"]]:
     named = {PurePosixPath(path).stem: pose for path, pose in poses.items()}
     if len(named) < len(poses):
         raise KroncError(f"two of {what} have the same file name: views are matched by file name")
     return named
 
 
-def _summary(errors: Float[Tensor, "n"]) -> dict[str, float]:
-    return {"mean": float(errors.mean()), "median": float(errors.quantile(0.5)), "max": float(errors.max())}
+def _summary(errors: Float[np.ndarray, "n"]) -> dict[str, float]:
+    return {"mean": float(errors.mean()), "median": float(np.median(errors)), "max": float(errors.max())}

@@ -96,12 +96,12 @@ class KroncDataParser(DataParser):
         if not (folder / "kronc.json").exists() or config.keypoints is not None or config.any_solver_option():
             with progress_bar("solving poses") as progress:
                 folder = solve_cached(config.data, scene, config.solver_config(), progress)
-        record, (_, solution) = read_record(folder), read_solution(folder)
+        record = read_record(folder)
         CONSOLE.print(report_table(record, scene.notes))
         doubt = exit_status(record)
-        if solution.status is Status.FAILED:
+        if record["status"] == Status.FAILED.value:
             sys.exit(doubt)
-        return scene, solution
+        return scene, read_solution(folder)[1]
 
     def _outputs(self, split: str, scene: Scene, solution: Solution) -> DataparserOutputs:
         config, camera = self.config, solution.camera  # whose intrinsics may have been refined

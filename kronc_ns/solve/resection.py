@@ -25,7 +25,7 @@ from kronc_ns.solve.threads import in_parts
 _AZIMUTHS = 24
 _ELEVATIONS_DEG = (-5.0, 15.0, 35.0, 60.0)
 _ROLLS_DEG = (0.0, 90.0, 180.0, 270.0)
-_ROUNDS = ((4, 3), (2, 4), (1, 8))
+_ROUNDS = ((4, 4), (2, 5), (1, 8))
 """How many guesses of a view go through each round of refinement, and the steps of the round."""
 _BEHIND = 1.3
 """A view whose rival leaves so many times less unexplained after the first round is given up."""

@@ -40,7 +40,7 @@ class Measured(NamedTuple):
     joint: Array
     """[K] which point"""
     uv: Array
-    """[K, 2]"""
+    """[2, K]"""
     own: Array
     """[K] weight"""
     focal: Array
@@ -71,9 +71,9 @@ class Estimate(NamedTuple):
     intrinsics: Array
     """[2]: logarithm of the focal length's factor, k1"""
     seen: Array
-    """[K, 3]: place in the image plane, 1 / z"""
+    """[3, K]: place in the image plane, 1 / z"""
     error: Array
-    """[K, 2]: projection minus detection in pixels; 0 behind the camera"""
+    """[2, K]: projection minus detection in pixels; 0 behind the camera"""
     length: Array
     """[K]: its weighted length; `BEHIND_PX` behind the camera"""
     pull: Array
@@ -109,7 +109,7 @@ def measured(problem: Problem) -> Measured:
     return Measured(
         first,
         joint,
-        problem.uv[view, joint],
+        np.ascontiguousarray(problem.uv[view, joint].T),
         problem.weight[view, joint],
         np.array(problem.focal),
         np.empty(0) if shape is None else shape.mean,
@@ -131,8 +131,8 @@ def estimate(data: Measured, state: State) -> Estimate:
         np.array(state.translation),
         np.array(state.points),
         np.array([state.log_growth, state.k1]),
-        np.empty((count, 3)),
-        np.empty((count, 2)),
+        np.empty((3, count)),
+        np.empty((2, count)),
         np.empty(count),
         np.zeros(state.points.size),
         np.zeros(1),
@@ -166,13 +166,13 @@ def evaluate(data: Measured, now: Estimate) -> None:
             near = 1.0 / max(depth, NEAR)
             u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) * near
             v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) * near
-            now.seen[k, 0], now.seen[k, 1], now.seen[k, 2] = u, v, near
-            now.error[k, 0] = now.error[k, 1] = 0.0
+            now.seen[0, k], now.seen[1, k], now.seen[2, k] = u, v, near
+            now.error[0, k] = now.error[1, k] = 0.0
             now.length[k] = BEHIND_PX
             if not depth < NEAR:
                 px, py = pixel(u, v, fx, fy, k1)
-                dx, dy = px - data.uv[k, 0], py - data.uv[k, 1]
-                now.error[k, 0], now.error[k, 1] = dx, dy
+                dx, dy = px - data.uv[0, k], py - data.uv[1, k]
+                now.error[0, k], now.error[1, k] = dx, dy
                 now.length[k] = np.sqrt(data.own[k] * (dx * dx + dy * dy))
     if len(data.mean) and not data.points_known:
         joints, total = len(now.points), 0.0
@@ -395,7 +395,7 @@ def fill_rows(data: Measured, now: Estimate, weight: Any, n: int, a: Any, rows: 
     begin, count = data.first[n], data.first[n + 1] - data.first[n]
     for k in range(count):
         at, m = begin + k, count + k
-        u, v, near, root = now.seen[at, 0], now.seen[at, 1], now.seen[at, 2], np.sqrt(weight[at])
+        u, v, near, root = now.seen[0, at], now.seen[1, at], now.seen[2, at], np.sqrt(weight[at])
         xu, xv, yu, yv = pixel_by_plane(u, v, root * fx, root * fy, k1)
         u0, u1, u2, v0, v1, v2 = plane_by_turn(u, v)
         ux, uz, vy, vz = plane_by_shift(u, v, near)
@@ -403,7 +403,7 @@ def fill_rows(data: Measured, now: Estimate, weight: Any, n: int, a: Any, rows: 
         a[3, k], a[4, k], a[5, k] = xu * ux, xv * vy, xu * uz + xv * vz
         a[0, m], a[1, m], a[2, m] = yu * u0 + yv * v0, yu * u1 + yv * v1, yu * u2 + yv * v2
         a[3, m], a[4, m], a[5, m] = yu * ux, yv * vy, yu * uz + yv * vz
-        off[k], off[m] = root * now.error[at, 0], root * now.error[at, 1]
+        off[k], off[m] = root * now.error[0, at], root * now.error[1, at]
         for c in range(3):
             du, dv = plane_by_point(u, v, near, r[0, c], r[1, c], r[2, c])
             rows[c, k] = xu * du + xv * dv
@@ -411,7 +411,7 @@ def fill_rows(data: Measured, now: Estimate, weight: Any, n: int, a: Any, rows: 
     if data.with_focal or data.with_k1:
         for k in range(count):
             at, m, s = begin + k, count + k, 0
-            u, v, root = now.seen[at, 0], now.seen[at, 1], np.sqrt(weight[at])
+            u, v, root = now.seen[0, at], now.seen[1, at], np.sqrt(weight[at])
             if data.with_focal:
                 lens[0, k], lens[0, m] = pixel(u, v, root * fx, root * fy, k1)
                 s = 1

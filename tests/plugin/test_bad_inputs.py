@@ -4,6 +4,7 @@ import copy
 import functools
 import json
 import math
+import random
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,11 +20,11 @@ pytest.importorskip("nerfstudio")
 from kronc_ns.benchmark.training import write_variant
 from kronc_ns.files.presets import KroncConfig
 from kronc_ns.plugin import methods
-from kronc_ns.plugin.compatibility import UnavailableLpips
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
+from tests.plugin.commands import forget_writers
 
-pytestmark = pytest.mark.nerfstudio
+pytestmark = [pytest.mark.nerfstudio, pytest.mark.usefixtures("without_lpips")]
 METHODS = ["kronc_splatfacto_cpu", "kronc_tensorf_cpu", "kronc_dvgo_cpu"]
 CAMERA = default_camera("carpatch", 48)
 SMALL = {
@@ -31,14 +32,8 @@ SMALL = {
     "kronc_tensorf_cpu": {"upsampling_iters": (10, 20), "init_resolution": 16, "final_resolution": 24},
     "kronc_dvgo_cpu": {"coarse_iterations": 60, "coarse_voxels": 16**3, "fine_voxels": 24**3, "growth_steps": (10,)},
 }
+OF_VIEWS = ["views", "initial_c2w"]
 STEPS = {"kronc_splatfacto_cpu": 40, "kronc_tensorf_cpu": 40, "kronc_dvgo_cpu": 80}
-
-
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch, tmp_path):
-    """No LPIPS, which takes longest to build, and a cache of the test's own."""
-    monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: UnavailableLpips())
-    monkeypatch.setenv("KRONC_NS_CACHE", str(tmp_path / "cache"))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +46,7 @@ def rendered(tmp_path_factory) -> Callable[..., Path]:
             capture = make_capture("carpatch", 8, seed=5, camera=camera)
             data, folder = root / f"capture_{len(made)}", root / f"exact_{len(made)}"
             write_capture(data, capture, render=True)
-            write_variant(folder, data, "exact", KroncConfig(), torch.from_numpy(capture.car.keypoints))
+            write_variant(folder, data, "exact", KroncConfig(), capture.car.keypoints)
             made[camera] = folder
         return made[camera]
 
@@ -84,6 +79,8 @@ def painted(rendered, tmp_path) -> Callable[[str, int], Path]:
 
 def train(method: str, data: Path, out: Path, parser=None, model=None, steps=None, rates=None) -> dict[str, float]:
     """Metrics of the test views after a short training; every parameter must be finite."""
+    forget_writers()
+    random.seed(0)  # which images nerfstudio draws its rays from
     torch.manual_seed(0)
     config = copy.deepcopy(getattr(methods, method).config)
     manager = config.pipeline.datamanager
@@ -106,9 +103,9 @@ def train(method: str, data: Path, out: Path, parser=None, model=None, steps=Non
 
 def first_views(folder: Path, count: int) -> None:
     """Keep only the first views of a data set."""
-    for name, key in (("transforms.json", "frames"), ("keypoints.json", "frames"), ("kronc.json", "views")):
+    for name, keys in (("transforms.json", ["frames"]), ("keypoints.json", ["frames"]), ("kronc.json", OF_VIEWS)):
         content = json.loads((folder / name).read_text())
-        content[key] = content[key][:count]
+        content |= {key: content[key][:count] for key in keys}
         (folder / name).write_text(json.dumps(content))
 
 

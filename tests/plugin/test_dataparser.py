@@ -76,7 +76,7 @@ def no_solver(monkeypatch):
     def fail(*_):
         raise AssertionError("solved again")
 
-    return lambda: monkeypatch.setattr("kronc_ns.plugin.cache.solve_scene", fail)
+    return lambda: monkeypatch.setattr("kronc_ns.files.cache.solve_scene", fail)
 
 
 @pytest.fixture
@@ -104,6 +104,11 @@ def outputs(parser):
 def snapshot(folder: Path) -> dict[Path, tuple[int, bytes]]:
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
+def known_points(solution: Solution) -> torch.Tensor:
+    """The keypoints that have a place."""
+    return torch.from_numpy(solution.points[np.isfinite(solution.points).all(-1)]).float()
 
 
 def view_numbers(output) -> list[int]:
@@ -200,8 +205,8 @@ def test_a_view_with_three_keypoints_is_left_out_and_listed(changed, parser, edi
 def test_a_processed_folder_may_have_left_views_out(changed, solution, no_solver):
     views = list(solution.views)
     views[POOR] = replace(views[POOR], status=ViewStatus.FAILED, reason="3 keypoints, at least 4 are needed")
-    c2w = solution.c2w.clone()
-    c2w[POOR] = torch.nan
+    c2w = solution.c2w.copy()
+    c2w[POOR] = np.nan
     write_solution(changed, load_scene(changed), replace(solution, views=views, c2w=c2w), changed, "inputs")
     no_solver()
     one = KroncDataParserConfig(data=changed, background="keep").setup()
@@ -216,7 +221,7 @@ def test_a_processed_folder_may_have_left_views_out(changed, solution, no_solver
 def test_poses_are_the_solutions_moved_and_scaled(outputs, solution):
     output = outputs("all", scale_factor=2.0)
     c2w, move, scale = output.cameras.camera_to_worlds, output.dataparser_transform, output.dataparser_scale
-    expected = flip_camera_axes(solution.c2w).float()
+    expected = torch.from_numpy(flip_camera_axes(solution.c2w)).float()
     torch.testing.assert_close(c2w[..., :3], move[:, :3] @ expected[..., :3], atol=1e-5, rtol=0)
     centres = scale * (expected[..., 3] @ move[:, :3].T + move[:, 3])
     torch.testing.assert_close(c2w[..., 3], centres, atol=1e-5, rtol=0)
@@ -245,8 +250,7 @@ def test_splits_share_one_world(parser):
 def test_all_keypoints_lie_inside_the_box(outputs, solution):
     output = outputs()
     move, scale = output.dataparser_transform, output.dataparser_scale
-    points = solution.points[solution.points.isfinite().all(-1)].float()
-    points = scale * (points @ move[:, :3].T + move[:, 3])
+    points = scale * (known_points(solution) @ move[:, :3].T + move[:, 3])
     low, high = output.scene_box.aabb
     assert ((points > low) & (points < high)).all()
     size = high - low
@@ -338,21 +342,21 @@ def test_downscaled_images_come_with_their_intrinsics(changed, outputs):
 def test_random_seed_points_fill_the_box_and_hold_the_keypoints(outputs, solution):
     output, again = (outputs(num_seed_points=700, seeds="box") for _ in range(2))
     points, colours = output.metadata["points3D_xyz"], output.metadata["points3D_rgb"]
-    known = solution.points[solution.points.isfinite().all(-1)]
+    known = known_points(solution)
     assert len(points) == len(colours) == 700 + len(known)
     assert colours.dtype == torch.uint8
     low, high = output.scene_box.aabb
     assert ((points >= low - 1e-6) & (points <= high + 1e-6)).all()
     assert ((points.amax(0) - points.amin(0)) > 0.95 * (high - low)).all()
     move, scale = output.dataparser_transform, output.dataparser_scale
-    keypoints = scale * (known.float() @ move[:, :3].T + move[:, 3])
+    keypoints = scale * (known @ move[:, :3].T + move[:, 3])
     assert torch.cdist(keypoints, points).amin(1).max() < 1e-3
     assert torch.equal(points, again.metadata["points3D_xyz"])
 
 
 def test_the_visual_hull_is_on_the_car_and_has_its_colours(outputs, solution):
     output = outputs(num_seed_points=3000)
-    known = int(solution.points.isfinite().all(-1).sum())
+    known = len(known_points(solution))
     points, colours = output.metadata["points3D_xyz"][known:], output.metadata["points3D_rgb"][known:]
     assert 300 < len(points) <= 3000
     keypoints = output.metadata["points3D_xyz"][:known]

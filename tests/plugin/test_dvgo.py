@@ -6,40 +6,31 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-pytestmark = pytest.mark.nerfstudio
 pytest.importorskip("nerfstudio")
 
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig  # noqa: E402
-from nerfstudio.cameras.cameras import Cameras  # noqa: E402
-from nerfstudio.cameras.rays import RayBundle  # noqa: E402
-from nerfstudio.data.scene_box import SceneBox  # noqa: E402
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes  # noqa: E402
-from nerfstudio.engine.optimizers import Optimizers  # noqa: E402
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from nerfstudio.engine.optimizers import Optimizers
 
-from kronc_ns.benchmark.training import train, write_variant  # noqa: E402
-from kronc_ns.fit.options import KroncConfig  # noqa: E402
-from kronc_ns.plugin.compatibility import UnavailableLpips  # noqa: E402
-from kronc_ns.plugin.dvgo import equations  # noqa: E402
-from kronc_ns.plugin.dvgo.field import view_rates  # noqa: E402
-from kronc_ns.plugin.dvgo.grid import RatedVoxelGrid, UnknownSpace, VoxelGrid, sample_corners, sample_fused  # noqa: E402
-from kronc_ns.plugin.dvgo.losses import StageLosses  # noqa: E402
-from kronc_ns.plugin.dvgo.model import DVGOModel, DVGOModelConfig  # noqa: E402
-from kronc_ns.plugin.dvgo.sampling import ray_box, sample_rays  # noqa: E402
-from kronc_ns.plugin.methods import kronc_dvgo_cpu  # noqa: E402
-from kronc_ns.synthetic.folder import write_capture  # noqa: E402
-from kronc_ns.synthetic.scenes import default_camera, make_capture  # noqa: E402
-from tests.plugin.commands import evaluate, run  # noqa: E402
+from kronc_ns.benchmark.training import train, write_variant
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.plugin.dvgo import equations
+from kronc_ns.plugin.dvgo.field import view_rates
+from kronc_ns.plugin.dvgo.grid import RatedVoxelGrid, UnknownSpace, VoxelGrid, sample_corners, sample_fused
+from kronc_ns.plugin.dvgo.losses import StageLosses
+from kronc_ns.plugin.dvgo.model import DVGOModel, DVGOModelConfig
+from kronc_ns.plugin.dvgo.sampling import ray_box, sample_rays
+from kronc_ns.plugin.methods import kronc_dvgo_cpu
+from kronc_ns.synthetic.folder import write_capture
+from kronc_ns.synthetic.scenes import default_camera, make_capture
+from tests.plugin.commands import InProcess, evaluate
 
+pytestmark = [pytest.mark.nerfstudio, pytest.mark.usefixtures("without_lpips")]
 BOX = torch.tensor([[-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]])
 RADIUS = 0.4
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _no_lpips():
-    """LPIPS takes longer to build than all else, and its weights may be missing."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: UnavailableLpips())
-        yield
 
 
 def test_alpha_is_the_paper_s_formula():
@@ -414,20 +405,19 @@ def test_total_variation_is_an_option():
 def test_nerfstudio_trains_resumes_evaluates_and_renders_across_the_stages(tmp_path):
     capture = make_capture("carpatch", views=24, seed=3, camera=default_camera("carpatch", 80))
     write_capture(tmp_path / "capture", capture, render=True)
-    points = torch.from_numpy(capture.car.keypoints)
-    write_variant(tmp_path / "exact", tmp_path / "capture", "exact", KroncConfig(), points)
+    write_variant(tmp_path / "exact", tmp_path / "capture", "exact", KroncConfig(), capture.car.keypoints)
     options = ["--pipeline.model.coarse-iterations", "150", "--pipeline.model.growth-steps", "60", "120"]
     options += ["--pipeline.model.coarse-voxels", "13824", "--pipeline.model.fine-voxels", "64000"]
-    checkpoints = None
+    commands, checkpoints = InProcess(), None
     for iterations in (140, 40, 220):  # within the coarse stage, across its end, and to the end of growth
         resume = [] if checkpoints is None else ["--load-dir", str(checkpoints)]
         steps = ["--max-num-iterations", str(iterations)]
         name = tmp_path / f"runs_{iterations}"
-        config = train(tmp_path / "exact", "kronc-dvgo-cpu", name, [*options, *steps, *resume])
+        config = train(tmp_path / "exact", "kronc-dvgo-cpu", name, [*options, *steps, *resume], commands=commands)
         checkpoints = config.parent / "nerfstudio_models"
     assert [path.stem for path in checkpoints.glob("*.ckpt")] == ["step-000000399"]
     assert evaluate(config)["psnr"] > 20
     output = tmp_path / "orbit.mp4"
     arguments = ["--load-config", str(config), "--output-path", str(output)]
-    run("ns-render", "interpolate", *arguments, "--interpolation-steps", "2", "--downscale-factor", "2")
+    commands.run("ns-render", "interpolate", *arguments, "--interpolation-steps", "2", "--downscale-factor", "2")
     assert output.stat().st_size > 1000

@@ -2,10 +2,10 @@
 
 import pytest
 
-from kronc_ns.benchmark.commands import Commands
 from kronc_ns.benchmark.nvs_measures import Trainings
 from kronc_ns.benchmark.nvs_rows import METHODS, nvs_tasks
 from kronc_ns.benchmark.rows import measure_rows
+from tests.plugin.commands import InProcess
 
 pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 
@@ -15,15 +15,14 @@ SHORT = {
     "kronc-tensorf-cpu": ["--max-num-iterations", "300", *RAYS],
     "kronc-dvgo-cpu": ["--max-num-iterations", "400", *RAYS],
 }
-KINDS = ("exact poses", "1 px at 400x400")  # two trainings side by side; unsolved poses: test_training, test_fields
+KINDS = ("exact poses", "1 px at 400x400")  # unsolved poses: test_training, test_fields
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_solved_poses_train_like_exact_ones(method, tmp_path):
-    with Commands({"OMP_NUM_THREADS": "1", "KRONC_NS_CACHE": str(tmp_path / "cache")}) as commands:
-        tasks = nvs_tasks(Trainings(tmp_path, commands, views=50, width=64, options=SHORT[method]))
-        chosen = [task for task in tasks if method in task.name and task.name.endswith(KINDS)]
-        rows = list(measure_rows(chosen, first_seed=7, workers=2))
+    tasks = nvs_tasks(Trainings(tmp_path, InProcess(), views=50, width=64, options=SHORT[method]))
+    chosen = [task for task in tasks if method in task.name and task.name.endswith(KINDS)]
+    rows = list(measure_rows(chosen, first_seed=7))
     assert not any(row.failures for row in rows), [row.failures for row in rows]
     exact, solved = (row.reached for row in rows)
     print(f"{method}: {exact}, {solved}")

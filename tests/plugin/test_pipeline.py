@@ -13,7 +13,6 @@ from nerfstudio.data.scene_box import SceneBox
 
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.rotations import so3_exp
-from kronc_ns.plugin.compatibility import UnavailableLpips
 from kronc_ns.plugin.dvgo.model import DVGOModelConfig
 from kronc_ns.plugin.pipeline import check_finite, check_parameters, refined_pose
 from kronc_ns.plugin.splat_cpu.model import SplatfactoCpuModelConfig
@@ -70,8 +69,8 @@ def error(c2w: torch.Tensor, truth: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize(("build", "whole"), [(splats, True), (voxels, False)])
-def test_a_camera_is_found_by_its_image(build, whole, monkeypatch):
-    monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: UnavailableLpips())
+@pytest.mark.usefixtures("without_lpips")
+def test_a_camera_is_found_by_its_image(build, whole):
     model = build().eval()
     before = {name: value.clone() for name, value in model.state_dict().items()}
     truth = torch.eye(4)[:3].clone()

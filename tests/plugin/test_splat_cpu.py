@@ -21,7 +21,7 @@ from kronc_ns.plugin.splat_cpu.rendering import rasterization
 from kronc_ns.plugin.splat_cpu.tiles import tile_lists
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
-from tests.plugin.commands import add_half_size, evaluate, run
+from tests.plugin.commands import InProcess, add_half_size, evaluate
 
 from . import splat_reference
 
@@ -247,12 +247,11 @@ def trained(tmp_path_factory):
     capture = make_capture("walk", views=24, seed=3, camera=default_camera("walk", 320))
     write_capture(root / "capture", capture, render=True)
     add_half_size(root / "capture")
-    points = torch.from_numpy(capture.car.keypoints)
-    write_variant(root / "exact", root / "capture", "exact", load_config("phone_walk"), points)
+    write_variant(root / "exact", root / "capture", "exact", load_config("phone_walk"), capture.car.keypoints)
     settings = {"warmup-length": 100, "resolution-schedule": 300, "stop-split-at": 450, "sh-degree-interval": 150}
     options = [text for name, value in settings.items() for text in (f"--pipeline.model.{name}", str(value))]
     options += ["--max-num-iterations", "600"]
-    return train(root / "exact", METHOD, root / "runs", options, HALF), root / "exact"
+    return train(root / "exact", METHOD, root / "runs", options, HALF, InProcess()), root / "exact"
 
 
 @pytest.mark.slow
@@ -271,12 +270,12 @@ def test_training_without_cuda_densifies_and_renders_the_car(trained, tmp_path):
 
 @pytest.mark.slow
 def test_a_training_without_cuda_is_resumed_exported_and_rendered(trained, tmp_path):
-    config, data = trained
+    (config, data), commands = trained, InProcess()
     more = ["--load-dir", str(config.parent / "nerfstudio_models"), "--max-num-iterations", "10"]
-    resumed = train(data, METHOD, tmp_path, more, HALF)
+    resumed = train(data, METHOD, tmp_path, more, HALF, commands)
     assert (resumed.parent / "nerfstudio_models" / "step-000000609.ckpt").exists()
-    run("ns-export", "gaussian-splat", "--load-config", str(config), "--output-dir", str(tmp_path / "ply"))
+    commands.run("ns-export", "gaussian-splat", "--load-config", str(config), "--output-dir", str(tmp_path / "ply"))
     assert (tmp_path / "ply" / "splat.ply").read_bytes().startswith(b"ply")
     frame = ["--load-config", str(config), "--output-path", str(tmp_path / "frames"), "--output-format", "images"]
-    run("ns-render", "interpolate", *frame, "--interpolation-steps", "1", "--downscale-factor", "2")
+    commands.run("ns-render", "interpolate", *frame, "--interpolation-steps", "1", "--downscale-factor", "2")
     assert len(list((tmp_path / "frames").rglob("*.jpg"))) > 1

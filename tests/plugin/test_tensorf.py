@@ -10,7 +10,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components.encodings import TensorVMEncoding
 
-from kronc_ns.plugin.compatibility import UnavailableLpips
 from kronc_ns.plugin.tensorf import PosableTensoRFModelConfig, PosableVMEncoding
 
 pytestmark = pytest.mark.nerfstudio
@@ -32,8 +31,8 @@ def test_gradients_at_positions_are_those_of_finite_differences():
 
 
 @pytest.mark.parametrize("mode", ["off", "SO3xR3"])
-def test_the_camera_optimiser_feels_where_cameras_are(mode, monkeypatch):
-    monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: UnavailableLpips())
+@pytest.mark.usefixtures("without_lpips")
+def test_the_camera_optimiser_feels_where_cameras_are(mode):
     torch.manual_seed(0)
     config = PosableTensoRFModelConfig(
         camera_optimizer=CameraOptimizerConfig(mode=mode), init_resolution=8, num_uniform_samples=24, num_samples=12
