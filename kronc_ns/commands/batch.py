@@ -2,15 +2,11 @@
 
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
-from kronc_ns.capture.depth import with_depths
 from kronc_ns.commands.console import progress_bar
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import fingerprint
@@ -51,6 +47,21 @@ def expand(patterns: Sequence[Path]) -> list[Path]:
     return folders
 
 
+def add_depths(
+    scene: Scene,
+    folder: Path,
+    config: KroncConfig,
+    weights: Path | None,
+    progress: Callable[[int, int, float | None], None] | None = None,
+) -> Scene:
+    """The scene with the depths that ``config`` starts from, if it wants any."""
+    if config.depth_init == "random" and weights is None:
+        return scene
+    from kronc_ns.capture.depth import with_depths  # torch and OpenCV
+
+    return with_depths(scene, folder, config, weights, progress)
+
+
 def solve_folders(
     folders: Sequence[Path], output_dir: Path, config: KroncConfig, depth_weights: Path | None = None
 ) -> int:
@@ -58,6 +69,9 @@ def solve_folders(
 
     Prints a table; returns 2 where a scene could not be read or written, else 3 for a doubtful solution, else 0.
     """
+    from rich.console import Console
+    from rich.table import Table
+
     names = [folder.resolve().name for folder in folders]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
@@ -90,7 +104,7 @@ def _solve_some(
     scenes: dict[Path, Scene] = {}
     for folder in folders:
         try:
-            scenes[folder] = with_depths(load_scene(folder), folder, config, depth_weights)
+            scenes[folder] = add_depths(load_scene(folder), folder, config, depth_weights)
         except (KroncError, OSError) as error:
             outcomes[folder] = Outcome(folder, "error", str(error))
     solutions = solve_scenes(list(scenes.values()), config)

@@ -2,20 +2,17 @@
 
 import errno
 import signal
-import statistics
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import PurePosixPath
-from typing import Any
-
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
+from typing import TYPE_CHECKING, Any
 
 from kronc_ns.errors import KroncError
-from kronc_ns.solution import Status, ViewStatus
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 _LISTED = 8  # failed views named in the table
 _METRICS = {"psnr": 2, "ssim": 4, "lpips": 4}  # decimals
@@ -53,6 +50,8 @@ def _terminate(*_: object) -> None:
 
 def exit_status(report: Mapping[str, Any]) -> int:
     """0 for a trustworthy solution (kronc.json's content), else 3 with the reason on stderr."""
+    from kronc_ns.solution import Status
+
     trusted = report["status"] == Status.CONVERGED.value
     return 0 if trusted else _fail(f"{report['status']}: {report['reason']}", 3)
 
@@ -65,6 +64,9 @@ def _fail(message: str, status: int) -> int:
 @contextmanager
 def progress_bar(description: str) -> Iterator[Callable[[int, int, float | None], None]]:
     """A bar on stderr with time left; the callback takes (step, steps, loss or None)."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -83,8 +85,14 @@ def progress_bar(description: str) -> Iterator[Callable[[int, int, float | None]
         yield advance
 
 
-def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> Table:
+def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> "Table":
     """Summary of kronc.json's content: views solved and failed (with reasons), residuals, time, ``notes``."""
+    from statistics import median
+
+    from rich.table import Table
+
+    from kronc_ns.solution import ViewStatus
+
     views = report["views"]
     solved = sum(view["status"] == ViewStatus.SOLVED.value for view in views)
     failed = [view for view in views if view["status"] == ViewStatus.FAILED.value]
@@ -102,12 +110,12 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> Table:
         table.add_row("  left out", f"{view['file_path']}: {view['reason']}")
     if len(failed) > _LISTED:
         table.add_row("  left out", f"... and {len(failed) - _LISTED} more (kronc.json lists all)")
-    rmse, median = report["rmse_px"], report["median_px"]
-    if rmse is not None and median is not None:
-        table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {median:.2f} px of all")
+    rmse, middle = report["rmse_px"], report["median_px"]
+    if rmse is not None and middle is not None:
+        table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {middle:.2f} px of all")
     sigmas = [[view[key] for view in views if view[key] is not None] for key in ("sigma_rot_deg", "sigma_trans_m")]
     if all(sigmas):
-        rotation, centre = (statistics.median(values) for values in sigmas)
+        rotation, centre = (median(values) for values in sigmas)
         table.add_row("standard deviation", f"{rotation:.2f} deg, {100 * centre:.1f} cm (median view)")
     table.add_row("solver", f"{report['solver']} from {report['init']} poses, {report['iterations']} steps")
     table.add_row("time", f"{report['seconds']:.3f} s")
@@ -116,8 +124,10 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> Table:
     return table
 
 
-def metrics_table(result: Mapping[str, Any]) -> Table:
+def metrics_table(result: Mapping[str, Any]) -> "Table":
     """The content of `kronc eval --nvs --json`: full frame and vehicle, a line for each test view, means last."""
+    from rich.table import Table
+
     title = f"{result['method']}, step {result['step']}: {result['views']} test views"
     table = Table(title=title, title_justify="left")
     table.add_column("view", no_wrap=True)

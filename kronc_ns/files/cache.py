@@ -5,7 +5,6 @@ import json
 import os
 from dataclasses import asdict
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 

@@ -2,11 +2,9 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import read_json
-from kronc_ns.files.record import solved_points
+from kronc_ns.files.record import KEYPOINT_COLOUR, solved_points
 from kronc_ns.files.transforms import camera_and_frames, check_file_names, read_poses
 from kronc_ns.geometry.poses import invert
 
@@ -24,7 +22,6 @@ def write_colmap(folder: Path, solved: Path) -> int:
     camera, frames = camera_and_frames(read_json(transforms), transforms)
     check_file_names([frame["file_path"] for frame in frames], transforms)
     poses = read_poses(transforms)
-    points = solved_points(solved)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(
@@ -39,8 +36,8 @@ def write_colmap(folder: Path, solved: Path) -> int:
         w2c = invert(poses[frame["file_path"]])
         image = pycolmap.Image(name=Path(frame["file_path"]).name, camera_id=1, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(w2c))
-    for point in points:
-        model.add_point3D(point, pycolmap.Track(), np.array([200, 40, 40], dtype=np.uint8))
+    for point in solved_points(solved):
+        model.add_point3D(point, pycolmap.Track(), KEYPOINT_COLOUR)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         model.write_binary(str(folder))

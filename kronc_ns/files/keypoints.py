@@ -6,15 +6,18 @@ JSON. All of them become `Detections` with pixels in our convention (centre of t
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from kronc_ns.errors import KroncError
+from kronc_ns.files.images import read_grey
 from kronc_ns.files.output import read_json, write_json
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KNOWN_SCHEMAS, KeypointSchema, schema_of_count
+from kronc_ns.keypoints.selection import select_instances
 
 FORMATS = "our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO keypoint JSON"
 
@@ -54,6 +57,43 @@ def _read(path: Path) -> Detections:
     if path.name.endswith(".predictions.json"):
         return _read_openpifpaf(path.parent)
     raise KroncError(f"{path} is no keypoint file that can be read: expected {FORMATS}")
+
+
+def match_keypoints(
+    found: Detections, names: tuple[str, ...], camera: Camera, masks: list[Path] | None = None
+) -> tuple[Float[np.ndarray, "n j 3"], str]:
+    """Rows for each view from a keypoint file, matched by path or else by file name; and a note on choices made."""
+    if found.size is not None and found.size != (camera.width, camera.height):
+        raise KroncError(
+            f"{found.source} is for {found.size[0]}x{found.size[1]} images, the camera says "
+            f"{camera.width}x{camera.height}: expected keypoints in the pixels of the images"
+        )
+    by_name: dict[str, str] = {}
+    for name in names:
+        by_name[PurePosixPath(name).name] = "" if PurePosixPath(name).name in by_name else name
+    matched: dict[str, np.ndarray] = {}
+    unknown = []
+    for key, instances in found.frames.items():
+        name = key if key in names else by_name.get(PurePosixPath(key).name, "")
+        if name:
+            matched[name] = instances
+        else:
+            unknown.append(key)
+    if unknown:
+        raise KroncError(
+            f"{found.source} has keypoints for {len(unknown)} images that do not exist ({unknown[0]}): "
+            f"expected names like {names[0]}"
+        )
+    empty = np.zeros((0, len(found.schema), 3))
+    instances = [matched.get(name, empty) for name in names]
+    if not any((rows[..., 2] > 0).any() for rows in instances):
+        raise KroncError(
+            f"{found.source}: no keypoints for any of the {len(names)} images: expected at least 4 in 3 views"
+        )
+    several = [i for i, rows in enumerate(instances) if len(rows) > 1]
+    read = [read_grey(path) if i in several else None for i, path in enumerate(masks)] if masks and several else None
+    rows, note = select_instances(instances, (camera.width, camera.height), read)
+    return rows, note if several else ""
 
 
 def write_keypoints(

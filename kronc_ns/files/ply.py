@@ -7,16 +7,22 @@ from jaxtyping import Float, UInt8
 
 from kronc_ns.files.output import atomic_path
 
+_AXES, _BANDS = ("x", "y", "z"), ("red", "green", "blue")
+_VERTEX = np.dtype([*((axis, "<f4") for axis in _AXES), *((band, "u1") for band in _BANDS)])
+
 
 def write_points(path: Path, points: Float[np.ndarray, "k 3"], colours: UInt8[np.ndarray, "k 3"]) -> None:
     """Write coloured points as a binary PLY file."""
-    vertex = np.dtype([*((axis, "<f4") for axis in "xyz"), *((band, "u1") for band in ("red", "green", "blue"))])
-    rows = np.empty(len(points), vertex)
-    for values, names in ((points, "xyz"), (colours, ("red", "green", "blue"))):
-        for name, column in zip(names, values.T, strict=True):
-            rows[name] = column
-    kinds = {"<f4": "float", "|u1": "uchar"}
-    fields = [f"property {kinds[vertex[name].str]} {name}" for name in vertex.names or ()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *fields, "end_header"]
+    vertices = np.empty(len(points), _VERTEX)
+    for name, column in zip((*_AXES, *_BANDS), (*points.T, *colours.T), strict=True):
+        vertices[name] = column
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(points)}",
+        *(f"property float {axis}" for axis in _AXES),
+        *(f"property uchar {band}" for band in _BANDS),
+        "end_header\n",
+    ]
     with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode() + b"\n" + rows.tobytes())
+        temporary.write_bytes("\n".join(header).encode() + vertices.tobytes())

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import asdict
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,10 @@ from jaxtyping import Float
 
 import kronc_ns
 from kronc_ns.errors import KroncError
-from kronc_ns.files.keypoints import read_keypoints, write_keypoints
+from kronc_ns.files.keypoints import match_keypoints, read_keypoints, write_keypoints
 from kronc_ns.files.output import read_json, relative_path, release_output, write_json
 from kronc_ns.files.ply import write_points
 from kronc_ns.files.provenance import provenance
-from kronc_ns.files.scene_folder import match_keypoints
 from kronc_ns.files.transforms import camera_and_frames, read_poses, transforms_dict
 from kronc_ns.geometry.poses import camera_z
 from kronc_ns.scene import Scene
@@ -139,6 +138,29 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
     return Scene(names, camera, found.schema, keypoints), solution
 
 
+def solved_points(folder: Path) -> Float[np.ndarray, "j 3"]:
+    """The keypoints of a solved folder that have a place."""
+    record = read_record(folder)
+    try:
+        return _array([point for point in record["points"] if None not in point], (-1, 3))
+    except (KeyError, TypeError, ValueError):
+        raise _lacks(folder, "points") from None
+
+
+def left_out_views(folder: Path) -> set[str]:
+    """File names of the views that a solved folder's transforms.json no longer lists because they failed."""
+    record = read_record(folder)
+    try:
+        failed = [view["file_path"] for view in record["views"] if view["status"] == ViewStatus.FAILED.value]
+        return {PurePosixPath(name).name for name in failed}
+    except (KeyError, TypeError):
+        raise _lacks(folder, "views") from None
+
+
+def _lacks(folder: Path, key: str) -> KroncError:
+    return KroncError(f'{folder / "kronc.json"}: expected "{key}", as `kronc solve` writes them: solve again')
+
+
 def _view(view: dict[str, Any]) -> ViewReport:
     evidence = {key: value for key, value in view.items() if key != "file_path"}
     return ViewReport(**{**evidence, "name": view["file_path"], "status": ViewStatus(view["status"])})
@@ -166,14 +188,3 @@ def _number(value: float) -> float | None:
 def _rounded(pose: list[float]) -> list[float] | None:
     """The twelve numbers of a pose, row by row, as exact as a picture needs them; None where there is none."""
     return [round(x, 5) for x in pose] if all(map(math.isfinite, pose)) else None
-
-
-def solved_points(solved: Path) -> Float[np.ndarray, "j 3"]:
-    """The keypoints of a solved folder that have a place."""
-    try:
-        points = [point for point in read_record(solved)["points"] if None not in point]
-        return np.array(points, dtype=np.float64).reshape(-1, 3)
-    except (KeyError, TypeError, ValueError):
-        raise KroncError(
-            f'{solved / "kronc.json"}: expected "points", as `kronc solve` writes them: solve again'
-        ) from None

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files.images import depth_under, read_depth, read_grey
-from kronc_ns.files.keypoints import Detections, read_keypoints
+from kronc_ns.files.images import depth_under, read_depth
+from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints
 from kronc_ns.files.output import read_json
+from kronc_ns.files.record import left_out_views
 from kronc_ns.files.transforms import camera_and_frames, given_poses
 from kronc_ns.geometry.camera import Camera
-from kronc_ns.keypoints.selection import select_instances
 from kronc_ns.scene import Scene
 
 _UNDONE_PX, _FEW = 0.5, 0.05
@@ -56,53 +56,6 @@ def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
         masks=masks if any(masks) else None,
         notes=(note,) if note else (),
     )
-
-
-def match_keypoints(
-    found: Detections, names: tuple[str, ...], camera: Camera, masks: list[Path] | None = None
-) -> tuple[Float[np.ndarray, "n j 3"], str]:
-    """Rows for each view from a keypoint file, matched by path or else by file name; and a note on choices made."""
-    if found.size is not None and found.size != (camera.width, camera.height):
-        raise KroncError(
-            f"{found.source} is for {found.size[0]}x{found.size[1]} images, the camera says "
-            f"{camera.width}x{camera.height}: expected keypoints in the pixels of the images"
-        )
-    by_name: dict[str, str] = {}
-    for name in names:
-        by_name[PurePosixPath(name).name] = "" if PurePosixPath(name).name in by_name else name
-    matched: dict[str, np.ndarray] = {}
-    unknown = []
-    for key, instances in found.frames.items():
-        name = key if key in names else by_name.get(PurePosixPath(key).name, "")
-        if name:
-            matched[name] = instances
-        else:
-            unknown.append(key)
-    if unknown:
-        raise KroncError(
-            f"{found.source} has keypoints for {len(unknown)} images that do not exist ({unknown[0]}): "
-            f"expected names like {names[0]}"
-        )
-    empty = np.zeros((0, len(found.schema), 3))
-    instances = [matched.get(name, empty) for name in names]
-    if not any((rows[..., 2] > 0).any() for rows in instances):
-        raise KroncError(
-            f"{found.source}: no keypoints for any of the {len(names)} images: expected at least 4 in 3 views"
-        )
-    several = [i for i, rows in enumerate(instances) if len(rows) > 1]
-    read = [read_grey(path) if i in several else None for i, path in enumerate(masks)] if masks and several else None
-    rows, note = select_instances(instances, (camera.width, camera.height), read)
-    return rows, note if several else ""
-
-
-def left_out_views(folder: Path) -> set[str]:
-    """File names of the views that a solved folder's transforms.json no longer lists because they failed."""
-    file = folder / "kronc.json"
-    try:
-        views = read_json(file)["views"]
-        return {PurePosixPath(view["file_path"]).name for view in views if view["status"] == "failed"}
-    except (KeyError, TypeError):
-        raise KroncError(f'{file}: expected "views", as `kronc solve` writes them: solve again') from None
 
 
 def _without(found: Detections, file_names: set[str]) -> Detections:

@@ -198,7 +198,7 @@ def _all_alike(scene: Scene, solved: Bool[np.ndarray, "n"]) -> bool:
         return False
     uv = np.where(seen[..., None], scene.uv[chosen], math.inf)
     middle = np.sort(uv, axis=0)[np.maximum(seen.sum(0) - 1, 0) // 2, np.arange(seen.shape[1])]
-    off = (uv - middle)[seen]
+    off = uv[seen] - np.broadcast_to(middle, uv.shape)[seen]
     return float(np.median(np.hypot(off[:, 0], off[:, 1]))) < _ALIKE * _diagonal(scene)
 
 

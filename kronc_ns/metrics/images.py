@@ -77,8 +77,8 @@ def _similarity(rendered: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "
     import torch
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    images = [torch.from_numpy(_batch(image)) for image in (rendered, truth)]
-    _, similarity = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
+    x, y = (torch.from_numpy(_batch(image)) for image in (rendered, truth))
+    _, similarity = structural_similarity_index_measure(x, y, data_range=1.0, return_full_image=True)
     return similarity[0].mean(0).numpy()
 
 

@@ -16,6 +16,7 @@ from kronc_ns.solve import schur
 from kronc_ns.solve.compiled import compiled
 from kronc_ns.solve.linear import dot, factor, forward, inverse_factor
 from kronc_ns.solve.problem import Problem, State
+from kronc_ns.solve.threads import in_parts
 
 _TRACE = 1e-9  # of the gauge's directions, where points are too few to tell them apart
 _DAMPING = 1e-9  # keeps the gauge's zero pivots positive
@@ -42,16 +43,22 @@ def camera_covariance(
     schur.evaluate(data, now)
     work.weight[:] = data.own
     schur.reduce_system(data, now, work, _DAMPING, sigma_px**2 * shape_weight, sigma_px**2)
-    _covariances(data, now, work, sigma_px**2, covariance)
+    frame = _frame(now, data.joint, work.matrix[0])
+    if frame is None:
+        covariance[:] = np.nan
+    else:
+        in_parts(lambda part: _cameras(now, work, part, *frame, sigma_px**2, covariance), len(work.matrix))
     return covariance
 
 
 @compiled
-def _covariances(data: Any, now: Any, work: Any, variance: float, covariance: Any) -> None:
-    """Those of all cameras of a scene, from its reduced system."""
-    matrix = work.matrix
+def _frame(now: Any, joint: Any, matrix: Any) -> Any:
+    """What all cameras share: L^-1 G, G^T S^-1 G, and the matrix of `_gauge` and the mean. S becomes L.
+
+    None where S is not positive definite.
+    """
     size = len(matrix)
-    gauge, inverse, mean = _gauge(now.points, data.joint, size)
+    gauge, inverse, mean = _gauge(now.points, joint, size)
     stiffness = 0.0
     for i in range(size):
         stiffness += matrix[i, i] / size
@@ -61,18 +68,25 @@ def _covariances(data: Any, now: Any, work: Any, variance: float, covariance: An
             for k in range(i + 1):
                 matrix[i, k] += part * gauge[p, k]
     if not factor(matrix):
-        covariance[:] = np.nan
-        return
+        return None
     forward(matrix, gauge)
     shared = np.empty((7, 7))
     for p in range(7):
         for q in range(7):
             shared[p, q] = dot(gauge[p], gauge[q], size)
-    for n in range(len(now.rotation)):
+    return gauge, shared, inverse, mean
+
+
+@compiled
+def _cameras(
+    now: Any, work: Any, part: int, gauge: Any, shared: Any, inverse: Any, mean: Any, variance: float, out: Any
+) -> None:
+    """The covariances of the cameras in a part."""
+    for n in range(work.edges[part], work.edges[part + 1]):
         z = work.whitened[n]
-        forward(matrix, z)
+        forward(work.matrix[0], z)
         r, t, w = now.rotation[n], now.translation[n], work.whitener[n]
-        _camera_covariance(r, t, mean, w, z, gauge, shared, inverse, variance, covariance[n])
+        _camera_covariance(r, t, mean, w, z, gauge, shared, inverse, variance, out[n])
 
 
 @compiled

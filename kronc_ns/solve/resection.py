@@ -30,6 +30,7 @@ _ROUNDS = ((4, 4), (2, 5), (1, 8))
 _BEHIND = 1.3
 """A view whose rival leaves so many times less unexplained after the first round is given up."""
 _START_DAMPING = 1e-3
+_PARTS, _MANY = 2, 64  # guesses from which on they are refined in parts, one for each core
 _SAMPLE, _SAMPLES = 4, 1000  # points OpenCV draws at a time, and how often
 AWAY = -0.25
 """A point whose normal makes a larger angle with its ray (cosine below this) cannot be seen."""
@@ -149,7 +150,13 @@ def _refined(
 ) -> tuple[Float[np.ndarray, "k 3 4"], Float[np.ndarray, "k"]]:
     """Every guess after so many steps of robust least squares, and what it leaves unexplained."""
     w2c, cost = w2c.copy(), np.empty(len(view))
-    in_parts(lambda part: _refine(rows, view[part], w2c[part], most, steps, cost[part]), len(view))
+    edges = np.linspace(0, len(view), 1 + (_PARTS if len(view) >= _MANY else 1)).astype(int)
+
+    def run(part: int) -> None:
+        of = slice(edges[part], edges[part + 1])
+        _refine(rows, view[of], w2c[of], most, steps, cost[of])
+
+    in_parts(run, len(edges) - 1)
     return w2c, cost
 
 

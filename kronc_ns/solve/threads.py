@@ -4,17 +4,16 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import TypeVar
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _local = threading.local()
-_FEWEST = 64
-"""With less to do, a second thread costs more than it saves."""
 
 
 def side_by_side(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
-    """``map`` on all cores, in the items' order; within it nothing is split into parts."""
+    """``map`` on all cores, in the items' order; within it parts are run one after the other."""
 
     def alone(item: _Item) -> _Result:
         _local.alone = True
@@ -24,13 +23,23 @@ def side_by_side(function: Callable[[_Item], _Result], items: Sequence[_Item]) -
         yield from pool.map(alone, items)
 
 
-def in_parts(run: Callable[[slice], None], count: int) -> None:
-    """``run`` over slices of ``range(count)``, one for each core: for compiled loops, which need no interpreter."""
-    cores = os.cpu_count() or 1
-    if count < _FEWEST or cores < 2 or getattr(_local, "alone", False):
-        run(slice(0, count))
+def in_parts(run: Callable[[int], None], parts: int) -> None:
+    """``run(0)``, ``run(1)``, ... at the same time where there are cores: compiled loops, which need no interpreter."""
+    if parts < 2 or getattr(_local, "alone", False) or (os.cpu_count() or 1) < 2:
+        for part in range(parts):
+            run(part)
         return
-    size = -(-count // cores)
-    with ThreadPoolExecutor(cores) as pool:
-        for _ in pool.map(run, [slice(first, min(first + size, count)) for first in range(0, count, size)]):
-            pass
+    others = [_helpers().submit(run, part) for part in range(1, parts)]
+    run(0)
+    for other in others:
+        other.result()
+
+
+@lru_cache(maxsize=1)
+def _helpers() -> ThreadPoolExecutor:
+    """Threads that wait for parts; made when first needed, since a start takes as long as a part."""
+    return ThreadPoolExecutor((os.cpu_count() or 2) - 1, thread_name_prefix="kronc-part")
+
+
+if hasattr(os, "register_at_fork"):  # a child process has none of its parent's threads
+    os.register_at_fork(after_in_child=_helpers.cache_clear)

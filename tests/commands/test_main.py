@@ -3,75 +3,19 @@
 import errno
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
-import cv2
 import numpy as np
 import pytest
-import torch
 
-from kronc_ns.commands import main as cli
-from kronc_ns.files.images import read_depth
-from kronc_ns.files.keypoints import read_keypoints
 from kronc_ns.files.output import MARKER
 from kronc_ns.files.presets import preset_names
-from kronc_ns.files.transforms import camera_and_frames, read_poses
-from kronc_ns.geometry.camera import project
-from kronc_ns.geometry.poses import invert, transform
-from kronc_ns.geometry.rotations import rotation_angle_deg
-from kronc_ns.synthetic.car import build_car
-from kronc_ns.synthetic.car_parts import CarShape
+from kronc_ns.files.transforms import read_poses
+from tests.commands.conftest import contents
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::UserWarning")  # they would reach stderr
-
-
-class Result(NamedTuple):
-    status: int
-    out: str
-    err: str
-
-    def refused(self, *parts: str) -> bool:
-        """Exit status 2 and one line on stderr that holds all parts, nothing else."""
-        assert self.status == 2, self.err
-        assert self.err.startswith("error: ")
-        assert self.err.count("\n") == 1
-        assert self.err.endswith("\n")
-        assert "Traceback" not in self.out
-        for part in parts:
-            assert part in self.err
-        return True
-
-
-@pytest.fixture
-def kronc(monkeypatch, capsys):
-    """Run `kronc ARGUMENTS` in this process."""
-
-    def run(*arguments) -> Result:
-        monkeypatch.setattr(sys, "argv", ["kronc", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        return Result(int(caught.value.code or 0), *capsys.readouterr())
-
-    return run
-
-
-@pytest.fixture
-def short(tmp_path) -> Path:
-    """Enough steps from poses that are nearly right."""
-    (tmp_path / "short.yaml").write_text("init: given\nadam:\n  steps: 500\n  learning_rate: 0.05\n")
-    return tmp_path / "short.yaml"
-
-
-@pytest.fixture
-def hasty(tmp_path) -> Path:
-    """Too few steps for anything."""
-    (tmp_path / "hasty.yaml").write_text("solver: adam\nadam:\n  steps: 3\n")
-    return tmp_path / "hasty.yaml"
 
 
 @pytest.fixture
@@ -87,37 +31,6 @@ def garbage(edit):
         edit(scene / "keypoints.json", shuffle)
 
     return spoil
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
-    """What `kronc synth` writes, with noisy poses to start from."""
-    folder = tmp_path_factory.mktemp("cli") / "scene"
-    options = {"--views": 12, "--noise-px": 0.5, "--pose-noise-deg": 4.0, "--pose-noise-m": 0.3, "--seed": 5}
-    with pytest.MonkeyPatch.context() as patch:
-        flat = [str(part) for pair in options.items() for part in pair]
-        patch.setattr(sys, "argv", ["kronc", "synth", "--output-dir", str(folder), *flat])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-    assert not caught.value.code
-    return folder
-
-
-@pytest.fixture
-def scene(made, tmp_path) -> Path:
-    """A copy that a test may change."""
-    return Path(shutil.copytree(made, tmp_path / "scene"))
-
-
-@pytest.fixture
-def solved(scene, short, kronc, tmp_path) -> Path:
-    result = kronc("solve", "--data", scene, "--output-dir", tmp_path / "out", "--config", short)
-    assert result.status == 0, result.err
-    return tmp_path / "out"
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 # ---- the way through
@@ -179,7 +92,8 @@ def test_a_process_of_its_own_prints_no_more_than_that(scene, hasty, tmp_path, e
     edit(scene / "keypoints.json", lambda c: c["frames"][3].update(keypoints=[[0, 0, 0]] * 66))
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
     options = {"--data": scene, "--output-dir": tmp_path / "out", "--config": hasty}
-    command = [sys.executable, "-m", "kronc_ns.commands.main", "solve", *[str(part) for pair in options.items() for part in pair]]
+    flat = [str(part) for pair in options.items() for part in pair]
+    command = [sys.executable, "-m", "kronc_ns.commands.main", "solve", *flat]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
     assert done.returncode == 3
     assert done.stderr.startswith("failed: ")
@@ -206,94 +120,6 @@ def test_keypoints_may_lie_elsewhere(scene, short, kronc, tmp_path):
     arguments = ("solve", "--data", scene, "--output-dir", tmp_path / "out", "--config", short)
     assert kronc(*arguments).refused("keypoints")
     assert kronc(*arguments, "--keypoints", tmp_path / "found.json").status == 0
-
-
-# ---- synth
-
-
-def test_synth_follows_its_seed(kronc, tmp_path):
-    options = ("--views", 4, "--noise-px", 1, "--missing", 0.2, "--outliers", 0.1, "--pose-noise-deg", 1)
-    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        assert kronc("synth", "--output-dir", tmp_path / name, *options, "--seed", seed).status == 0
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    for file in ("keypoints.json", "reference.json", "transforms.json"):
-        assert (tmp_path / "a" / file).read_bytes() != (tmp_path / "c" / file).read_bytes()
-
-
-def test_noise_is_on_the_start_only(kronc, tmp_path):
-    """The reference explains the noiseless keypoints exactly; the start is off by as much as was asked for."""
-    noise = ("--pose-noise-deg", 3, "--pose-noise-m", 0.2)
-    assert kronc("synth", "--output-dir", tmp_path / "a", "--views", 40, *noise).status == 0
-    content = json.loads((tmp_path / "a/reference.json").read_text())
-    camera, _ = camera_and_frames(content, tmp_path)
-    truth, start = (
-        torch.stack(list(read_poses(tmp_path / "a" / f"{f}.json").values())) for f in ("reference", "transforms")
-    )
-    rows = np.concatenate(list(read_keypoints(tmp_path / "a").frames.values()))
-    points = torch.from_numpy(build_car(CarShape()).keypoints).expand(40, -1, -1)
-    pixels = project(transform(invert(truth), points), camera).numpy()
-    np.testing.assert_allclose(rows[..., :2][rows[..., 2] > 0], pixels[rows[..., 2] > 0], atol=1e-3)
-    offset = (start - truth)[..., 3]
-    angle = rotation_angle_deg(truth[..., :3].transpose(1, 2) @ start[..., :3])
-    assert float(offset.square().mean().sqrt()) == pytest.approx(0.2, rel=0.3)
-    assert float((angle.square().mean() / 3).sqrt()) == pytest.approx(3, rel=0.3)
-
-
-def test_without_pose_noise_there_is_no_start(kronc, tmp_path):
-    kronc("synth", "--output-dir", tmp_path / "a", "--views", 4)
-    assert read_poses(tmp_path / "a/transforms.json") == {}
-    assert len(read_poses(tmp_path / "a/reference.json")) == 4
-
-
-@pytest.mark.parametrize(("preset", "channels"), [("walk", 3), ("carpatch", 4)])
-def test_rendered_captures_have_images_masks_and_depths(kronc, tmp_path, preset, channels):
-    options = ("--preset", preset, "--views", 3, "--width", 64, "--render", "--pose-noise-m", 0.1)
-    result = kronc("synth", "--output-dir", tmp_path / "a", *options)
-    assert (result.status, result.err) == (0, "")
-    content = json.loads((tmp_path / "a/transforms.json").read_text())
-    camera, frames = camera_and_frames(content, tmp_path)
-    assert (camera.width, camera.height) == ((64, 36) if preset == "walk" else (64, 64))
-    size = (camera.height, camera.width)
-    reference = read_poses(tmp_path / "a/reference.json")
-    keypoints = read_keypoints(tmp_path / "a").frames
-    points = torch.from_numpy(build_car(CarShape()).keypoints)
-    assert len(frames) == 3
-    for frame in frames:
-        image = cv2.imread(str(tmp_path / "a" / frame["file_path"]), cv2.IMREAD_UNCHANGED)
-        mask = cv2.imread(str(tmp_path / "a" / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
-        depth = read_depth(tmp_path / "a" / frame["depth_file_path"])
-        assert image.shape == (*size, channels)
-        assert mask.shape == depth.shape == size
-        assert set(np.unique(mask)) == {0, 255}
-        assert image[mask > 0][:, :3].std() > 10
-        # the picture was taken from the reference pose: its depth under the keypoints is the points' own
-        rows = keypoints[frame["file_path"]][0]
-        seen = rows[:, 2] > 0
-        column, line = np.floor(rows[seen, :2]).astype(int).T
-        z = transform(invert(reference[frame["file_path"]]), points)[seen, 2].numpy()
-        on_car = mask[line, column] > 0
-        assert on_car.mean() > 0.7
-        assert np.median(np.abs(depth[line, column] - z)[on_car]) < 0.06
-        assert not torch.equal(
-            read_poses(tmp_path / "a/transforms.json")[frame["file_path"]], reference[frame["file_path"]]
-        )
-
-
-@pytest.mark.parametrize(
-    ("options", "parts"),
-    [
-        (("--outliers", 1.5), ["--outliers", "1.5"]),
-        (("--missing", -0.1), ["--missing", "-0.1"]),
-        (("--views", 0), ["--views", "0"]),
-        (("--width", 8), ["--width", "8"]),
-        (("--noise-px", -1), ["--noise-px"]),
-        (("--noise-px", "nan"), ["--noise-px"]),
-        (("--missing", "nan"), ["--missing"]),
-    ],
-)
-def test_impossible_captures_are_refused(kronc, tmp_path, options, parts):
-    assert kronc("synth", "--output-dir", tmp_path / "a", *options).refused(*parts)
-    assert not (tmp_path / "a").exists()
 
 
 # ---- errors a user can cause
@@ -422,7 +248,7 @@ def test_ctrl_c_exits_130_and_leaves_no_result(kronc, scene, short, tmp_path, mo
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("kronc_ns.pipeline.minimise", interrupted)
+        patch.setattr("kronc_ns.solve.adam.minimise", interrupted)
         result = kronc(*arguments)
     assert (result.status, result.err.count("\n")) == (130, 1)
     assert os.listdir(tmp_path / "out") == [MARKER]

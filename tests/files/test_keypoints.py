@@ -1,10 +1,15 @@
-import json
+"""Keypoint files of three formats become rows of the views they belong to."""
 
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files.keypoints import read_keypoints, write_keypoints
+from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints, write_keypoints
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import APOLLOCAR3D_24, APOLLOCAR3D_66, KeypointSchema
 
 
@@ -125,3 +130,56 @@ def test_missing_and_empty_places_name_the_formats(tmp_path):
 def test_nan_of_an_unseen_point_is_ignored(tmp_path):
     (tmp_path / "k.json").write_text(own([{"file_path": "a.png", "keypoints": [[float("nan"), 2, 0]] * 66}]))
     assert (read_keypoints(tmp_path / "k.json").frames["a.png"] == 0).all()
+
+
+# ---- which detections are whose
+
+
+CAMERA = Camera(500.0, 500.0, 240.0, 135.0, 480, 270)
+NAMES = ("images/a.png", "images/b.png", "images/c.png")
+
+
+def found(frames, size=(480, 270)) -> Detections:
+    return Detections(Path("k.json"), APOLLOCAR3D_66, frames, size)
+
+
+def test_rows_are_matched_by_path_or_by_file_name():
+    one, other = rows(0), rows(1)
+    matched, note = match_keypoints(found({"images/c.png": one[None], "photos/a.png": other[None]}), NAMES, CAMERA)
+    np.testing.assert_array_equal(matched, [other, np.zeros_like(one), one])
+    assert note == ""
+
+
+def test_paths_tell_apart_what_file_names_do_not():
+    names = ("left/a.png", "right/a.png")
+    matched, _ = match_keypoints(found({name: rows(i)[None] for i, name in enumerate(names)}), names, CAMERA)
+    np.testing.assert_array_equal(matched, [rows(0), rows(1)])
+    with pytest.raises(KroncError, match=r"1 images that do not exist \(a\.png\)"):
+        match_keypoints(found({"a.png": rows(0)[None]}), names, CAMERA)
+
+
+def test_of_several_cars_the_mask_tells_the_one(tmp_path):
+    near = rows(0)
+    far = np.where(near[:, 2:] > 0, near * [0.1, 0.1, 1] + [400, 200, 0], 0)
+    mask = np.zeros((270, 480), np.uint8)
+    mask[200:, 400:] = 255
+    masks = [tmp_path / f"{name}.png" for name in "abc"]
+    cv2.imwrite(str(masks[0]), mask)  # of images with one car masks are not read
+    frames = {"a.png": np.stack([near, far]), "b.png": far[None], "c.png": far[None]}
+    matched, note = match_keypoints(found(frames), NAMES, CAMERA, masks)
+    np.testing.assert_array_equal(matched[0], far)
+    assert note.startswith("1 images show several cars: the main one was taken by overlap with the mask")
+
+
+@pytest.mark.parametrize(
+    ("frames", "size", "message"),
+    [
+        ({"a.png": rows(0)[None]}, (960, 540), "is for 960x540 images, the camera says 480x270"),
+        ({"d.png": rows(0)[None]}, None, r"1 images that do not exist \(d\.png\): expected names like images/a\.png"),
+        ({"a.png": 0 * rows(0)[None]}, None, "no keypoints for any of the 3 images"),
+        ({}, None, "no keypoints for any of the 3 images"),
+    ],
+)
+def test_detections_that_do_not_fit_are_named(frames, size, message):
+    with pytest.raises(KroncError, match=message):
+        match_keypoints(found(frames, size), NAMES, CAMERA)

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Files appear whole or not at all, and nobody's folder is touched."""
 
 import errno
 import json
@@ -8,7 +8,8 @@ import os
 import pytest
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files.output import atomic_path, write_json
+from kronc_ns.files.output import MARKER, atomic_path, claim_output, release_output, write_json
+from tests.files.conftest import listing
 
 
 def disk_full(*_, **__):
@@ -73,3 +74,58 @@ def test_nan_is_refused_and_the_old_file_stays(tmp_path, value):
         write_json(file, [value])
     assert json.loads(file.read_text()) == [1.0]
     assert os.listdir(tmp_path) == ["a.json"]
+
+
+# ---- whose folder
+
+
+@pytest.mark.parametrize("name", ["photo.jpg", "transforms.json", "images/a.png"])
+def test_foreign_data_is_refused_and_stays(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    before = listing(tmp_path)
+    with pytest.raises(KroncError, match="choose a new or empty folder"):
+        claim_output(tmp_path)
+    assert listing(tmp_path) == before
+
+
+def test_a_file_is_no_folder(tmp_path):
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(KroncError, match="is a file"):
+        claim_output(tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_new_empty_and_own_folders_are_claimed(tmp_path):
+    claim_output(tmp_path / "a" / "new")
+    assert listing(tmp_path / "a" / "new").keys() == {(tmp_path / MARKER).relative_to(tmp_path)}
+    (tmp_path / "empty").mkdir()
+    claim_output(tmp_path / "empty")
+    claim_output(tmp_path / "empty")  # holds the marker of an interrupted run
+    release_output(tmp_path / "empty")
+    assert not any((tmp_path / "empty").iterdir())
+
+
+def test_a_finished_result_is_taken_back_before_it_is_written_over(solved):
+    claim_output(solved)
+    assert (solved / MARKER).exists()
+    assert not (solved / "kronc.json").exists()
+
+
+def test_results_of_another_kind_are_not_replaced(solved, tmp_path):
+    """Rendering a capture, or solving another, must not take a data set with its detections."""
+    before = listing(solved)
+    with pytest.raises(KroncError, match="holds a solution, which is not for a capture to replace"):
+        claim_output(solved, "capture")
+    assert listing(solved) == before
+    claim_output(tmp_path / "data", "data set")
+    for other in ("solution", "capture"):
+        with pytest.raises(KroncError, match="holds a data set"):
+            claim_output(tmp_path / "data", other)
+    claim_output(tmp_path / "data", "data set")
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(KroncError, match="out cannot be written"):
+        claim_output(tmp_path / "file" / "out")

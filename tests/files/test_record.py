@@ -1,85 +1,35 @@
-"""Solutions on disk: what is written is what is read, and nobody's data is touched."""
+"""Solutions on disk: what is written is what is read, and an interrupted write is no result."""
 
 import errno
 import json
 import math
 import os
-import zlib  # noqa: F401 - before pycolmap, which aborts the process otherwise
 from dataclasses import replace
+from importlib.metadata import version
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files.cache import fingerprint
-from kronc_ns.files.colmap import write_colmap
-from kronc_ns.files.output import MARKER, claim_output, release_output
-from kronc_ns.files.ply import write_ply
-from kronc_ns.files.record import write_solution
+from kronc_ns.files.output import MARKER, claim_output
+from kronc_ns.files.record import left_out_views, read_solution, solved_points, write_solution
 from kronc_ns.files.scene_folder import load_scene
 from kronc_ns.files.transforms import read_poses
 from kronc_ns.fit.options import KroncConfig
-from kronc_ns.geometry.camera import project
-from kronc_ns.geometry.poses import invert, transform
-from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
-
-FAILED_VIEW = 5
-
-
-@pytest.fixture
-def scene(walk_folder):
-    return load_scene(walk_folder)
-
-
-@pytest.fixture
-def solution(scene, walk_capture) -> Solution:
-    """The true poses as a solution in which one view failed and one keypoint is unknown."""
-    points = torch.from_numpy(walk_capture.car.keypoints).clone()
-    points[3] = torch.nan
-    c2w = walk_capture.c2w.clone()
-    c2w[FAILED_VIEW] = torch.nan
-    views = [ViewReport(name, ViewStatus.SOLVED, 20, 18, 0.7) for name in scene.names]
-    views[FAILED_VIEW] = ViewReport(scene.names[FAILED_VIEW], ViewStatus.FAILED, 3, 0, None, reason="3 keypoints")
-    depths = transform(invert(c2w), points.expand(16, -1, -1))[..., 2]
-    return Solution(
-        status=Status.CONVERGED,
-        reason="all is well",
-        names=scene.names,
-        camera=scene.camera,
-        c2w=c2w,
-        points=points,
-        depths=depths,
-        views=tuple(views),
-        initial_c2w=walk_capture.c2w,
-        solver="adam",
-        init="circular",
-        iterations=10,
-        seconds=1.0,
-        rmse_px=0.7,
-        median_px=0.6,
-        history={"step": [1.0], "loss": [2.0]},
-    )
-
-
-@pytest.fixture
-def solved(tmp_path, walk_folder, scene, solution):
-    """The solution written to a folder."""
-    folder = tmp_path / "out"
-    claim_output(folder)
-    write_solution(folder, scene, solution, walk_folder, "abc")
-    return folder
-
-
-def kept(solution):
-    return [i for i in range(len(solution.names)) if i != FAILED_VIEW]
+from kronc_ns.fit.pipeline import solve_scene
+from kronc_ns.fit.verdict import inliers
+from kronc_ns.scene import Scene
+from kronc_ns.solution import Solution, Status, ViewStatus
+from kronc_ns.synthetic.variations import swap_sides
+from tests.conftest import scene_of
+from tests.files.conftest import FAILED_VIEW, KEPT
 
 
 def test_poses_come_back_as_they_were_without_failed_views(solved, solution):
     poses = read_poses(solved / "transforms.json")
-    assert [name.split("/")[-1] for name in poses] == [solution.names[i].split("/")[-1] for i in kept(solution)]
-    torch.testing.assert_close(torch.stack(list(poses.values())), solution.c2w[kept(solution)], atol=1e-12, rtol=0)
+    assert [name.split("/")[-1] for name in poses] == [solution.names[i].split("/")[-1] for i in KEPT]
+    np.testing.assert_allclose(list(poses.values()), solution.c2w[KEPT], atol=1e-12)
 
 
 def test_images_are_found_from_the_output_folder(solved, walk_folder, scene):
@@ -98,7 +48,7 @@ def test_a_solution_is_a_scene_again_whose_poses_are_no_start(solved, walk_folde
     (solved / "keypoints.json").write_text(json.dumps(content))
     again = load_scene(solved)
     assert again.camera == scene.camera
-    torch.testing.assert_close(again.keypoints, scene.keypoints[[i for i in range(16) if i != FAILED_VIEW]])
+    np.testing.assert_array_equal(again.keypoints, scene.keypoints[KEPT])
     assert again.given_c2w is None
 
 
@@ -143,69 +93,10 @@ def test_a_loss_that_was_not_finite_is_null(tmp_path, walk_folder, scene, soluti
 
 
 def test_the_keypoint_cloud_holds_the_known_points(solved, solution):
-    known = solution.points[solution.points.isfinite().all(-1)]
+    known = solution.points[np.isfinite(solution.points).all(-1)]
     cloud = trimesh.load(solved / "keypoints.ply")
     np.testing.assert_allclose(cloud.vertices, known, atol=1e-6)
     assert json.loads((solved / "transforms.json").read_text())["ply_file_path"] == "keypoints.ply"
-
-
-# ---- whose folder
-
-
-def listing(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-@pytest.mark.parametrize("name", ["photo.jpg", "transforms.json", "images/a.png"])
-def test_foreign_data_is_refused_and_stays(tmp_path, name):
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).write_text("mine")
-    before = listing(tmp_path)
-    with pytest.raises(KroncError, match="choose a new or empty folder"):
-        claim_output(tmp_path)
-    assert listing(tmp_path) == before
-
-
-def test_a_file_is_no_folder(tmp_path):
-    (tmp_path / "out").write_text("mine")
-    with pytest.raises(KroncError, match="is a file"):
-        claim_output(tmp_path / "out")
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-def test_new_empty_and_own_folders_are_claimed(tmp_path):
-    claim_output(tmp_path / "a" / "new")
-    assert listing(tmp_path / "a" / "new").keys() == {(tmp_path / MARKER).relative_to(tmp_path)}
-    (tmp_path / "empty").mkdir()
-    claim_output(tmp_path / "empty")
-    claim_output(tmp_path / "empty")  # holds the marker of an interrupted run
-    release_output(tmp_path / "empty")
-    assert not any((tmp_path / "empty").iterdir())
-
-
-def test_a_finished_result_is_taken_back_before_it_is_written_over(solved):
-    claim_output(solved)
-    assert (solved / MARKER).exists()
-    assert not (solved / "kronc.json").exists()
-
-
-def test_results_of_another_kind_are_not_replaced(solved, tmp_path):
-    """Rendering a capture, or solving another, must not take a data set with its detections."""
-    before = listing(solved)
-    with pytest.raises(KroncError, match="holds a solution, which is not for a capture to replace"):
-        claim_output(solved, "capture")
-    assert listing(solved) == before
-    claim_output(tmp_path / "data", "data set")
-    for other in ("solution", "capture"):
-        with pytest.raises(KroncError, match="holds a data set"):
-            claim_output(tmp_path / "data", other)
-    claim_output(tmp_path / "data", "data set")
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(KroncError, match="out cannot be written"):
-        claim_output(tmp_path / "file" / "out")
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))])
@@ -232,65 +123,126 @@ def test_an_interrupted_write_is_marked_and_the_next_one_works(
     assert sorted(os.listdir(solved)) == ["keypoints.json", "keypoints.ply", "kronc.json", "transforms.json"]
 
 
-def test_inputs_are_the_fingerprint_of_what_was_solved(tmp_path, walk_folder, scene, solution):
-    claim_output(tmp_path / "out")
-    write_solution(tmp_path / "out", scene, solution, walk_folder, fingerprint(scene, KroncConfig()))
-    again = load_scene(walk_folder)
-    assert json.loads((tmp_path / "out/kronc.json").read_text())["inputs"] == fingerprint(again, KroncConfig())
+# ---- read back
 
 
-# ---- other formats
+def written(folder, scene: Scene, solution: Solution):
+    claim_output(folder)
+    write_solution(folder, scene, solution, folder.parent / "scene", "abc")
+    return folder
 
 
-@pytest.fixture
-def model(solved, tmp_path):
-    import pycolmap
-
-    assert write_colmap(tmp_path / "colmap", solved) == 15
-    return pycolmap.Reconstruction(str(tmp_path / "colmap"))
-
-
-def test_a_colmap_model_needs_file_names_of_their_own(solved, edit, tmp_path):
-    edit(solved / "transforms.json", lambda c: [f.update(file_path=f"{i}/a.png") for i, f in enumerate(c["frames"])])
-    with pytest.raises(KroncError, match=r"15 images in different folders are called a\.png"):
-        write_colmap(tmp_path / "colmap", solved)
+@pytest.fixture(scope="module")
+def swapped_lap(lap) -> tuple[Scene, Solution]:
+    """A walk with confused sides in some views and two views without keypoints, solved."""
+    capture, _ = swap_sides(lap, 0.2, np.random.default_rng(1))
+    keypoints = capture.keypoints.copy()
+    keypoints[[4, 9], :, 2] = 0
+    scene = scene_of(replace(capture, keypoints=keypoints))
+    return scene, solve_scene(scene, KroncConfig())
 
 
-def test_colmap_camera_images_and_poses(model, solution):
-    (camera,) = model.cameras.values()
-    ours = solution.camera
-    assert camera.model.name == "OPENCV"
-    assert (camera.width, camera.height) == (ours.width, ours.height)
-    np.testing.assert_allclose(camera.params, [ours.fx, ours.fy, ours.cx, ours.cy, *ours.distortion])
-    images = {image.name: image for image in model.images.values()}
-    assert sorted(images) == [solution.names[i].split("/")[-1] for i in kept(solution)]
-    for i in kept(solution):
-        w2c = images[solution.names[i].split("/")[-1]].cam_from_world().matrix()
-        np.testing.assert_allclose(w2c, invert(solution.c2w[i]).numpy(), atol=1e-9)
+def test_what_is_read_is_what_was_solved(tmp_path, swapped_lap):
+    scene, solution = swapped_lap
+    again_scene, again = read_solution(written(tmp_path / "out", scene, solution))
+    for name in ("c2w", "points", "initial_c2w", "path"):
+        np.testing.assert_allclose(getattr(again, name), getattr(solution, name), atol=1e-5)
+    straight = [i for i, view in enumerate(solution.views) if not view.swapped]
+    np.testing.assert_allclose(again.depths[straight], solution.depths[straight], atol=1e-9)
+    same = {
+        name: getattr(solution, name)
+        for name in ("status", "reason", "camera", "views", "solver", "init", "iterations", "rmse_px", "median_px")
+    }
+    assert {name: getattr(again, name) for name in same} == same
+    assert {key: list(values) for key, values in again.history.items()} == dict(solution.history)
+    assert again.names == again_scene.names == tuple(f"../scene/{name}" for name in scene.names)
 
 
-def test_colmap_projects_as_we_do(model, solution):
-    images = {image.name: image for image in model.images.values()}
-    for i in kept(solution)[::4]:
-        pixels = project(transform(invert(solution.c2w[i]), solution.points), solution.camera)
-        for j in (0, 10, 40, 65):
-            theirs = images[solution.names[i].split("/")[-1]].project_point(solution.points[j].numpy())
-            np.testing.assert_allclose(theirs, pixels[j].numpy(), atol=1e-6)
+def test_detections_come_back_with_left_and_right_put_right(tmp_path, swapped_lap):
+    """Then the solved points explain them as well as the solver said, view by view."""
+    scene, solution = swapped_lap
+    assert any(view.swapped for view in solution.views)
+    _, inlier = inliers(*read_solution(written(tmp_path / "out", scene, solution)))
+    solved = [i for i, view in enumerate(solution.views) if view.status is ViewStatus.SOLVED]
+    assert inlier.sum(1)[solved].tolist() == [solution.views[i].inliers for i in solved]
 
 
-def test_colmap_holds_the_keypoints(model, solution):
-    known = solution.points[solution.points.isfinite().all(-1)].numpy()
-    theirs = np.array([model.points3D[k].xyz for k in sorted(model.points3D)])
-    np.testing.assert_allclose(theirs, known, atol=1e-12)
+def test_a_failed_solution_without_any_pose_is_read(tmp_path, swapped_lap):
+    scene, solution = swapped_lap
+    lost = tuple(replace(view, status=ViewStatus.FAILED) for view in solution.views)
+    nothing = replace(
+        solution,
+        status=Status.FAILED,
+        views=lost,
+        c2w=np.full_like(solution.c2w, np.nan),
+        initial_c2w=np.full_like(solution.c2w, np.nan),
+    )
+    _, again = read_solution(written(tmp_path / "out", scene, nothing))
+    assert again.status is Status.FAILED
+    assert np.isnan(again.c2w).all()
+    assert again.camera == solution.camera
 
 
-def test_ply_holds_camera_centres_and_keypoints(solved, solution, tmp_path):
-    count = write_ply(tmp_path / "new" / "cameras.ply", solved)
-    cloud = trimesh.load(tmp_path / "new" / "cameras.ply")
-    centres = solution.c2w[kept(solution), :, 3]
-    known = solution.points[solution.points.isfinite().all(-1)]
-    assert count == len(cloud.vertices) == 15 + 65
-    np.testing.assert_allclose(cloud.vertices, torch.cat([centres, known]), atol=1e-5)
-    blue, red = cloud.colors[:15], cloud.colors[15:]
-    assert (blue[:, 2] > blue[:, 0]).all()
-    assert (red[:, 0] > red[:, 2]).all()
+def test_images_of_equal_file_name_are_told_apart(tmp_path, swapped_lap):
+    scene, solution = swapped_lap
+    names = tuple(f"{'ab'[i % 2]}/{i // 2}.png" for i in range(len(scene)))
+    views = tuple(replace(view, name=name) for view, name in zip(solution.views, names, strict=True))
+    renamed = replace(scene, names=names), replace(solution, names=names, views=views)
+    again_scene, again = read_solution(written(tmp_path / "out", *renamed))
+    np.testing.assert_allclose(again.c2w, solution.c2w, atol=1e-9)
+    np.testing.assert_array_equal(again_scene.seen.sum(1), scene.seen.sum(1))
+
+
+def test_a_solved_folder_can_be_solved_again_from_its_own_files(tmp_path, swapped_lap):
+    scene, solution = swapped_lap
+    again = load_scene(written(tmp_path / "out", scene, solution))
+    seen = scene.seen[solution.posed]
+    np.testing.assert_array_equal(again.seen, seen)
+    np.testing.assert_allclose(again.uv[seen], scene.uv[solution.posed][seen], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda record: record.pop("history"), "history"),
+        (lambda record: record["views"][0].update(status="perhaps"), "perhaps"),
+        (lambda record: record["views"][0].pop("file_path"), "file_path"),
+        (lambda record: record.update(views=3), "not as `kronc solve` writes it"),
+        (lambda record: record["points"].pop(), "65 points"),
+    ],
+)
+def test_a_broken_record_is_named(tmp_path, swapped_lap, edit, change, says):
+    folder = written(tmp_path / "out", *swapped_lap)
+    edit(folder / "kronc.json", change)
+    with pytest.raises(KroncError, match=says) as caught:
+        read_solution(folder)
+    assert "kronc.json" in str(caught.value)
+    assert "solve again" in str(caught.value)
+
+
+def test_a_folder_that_is_not_solved_is_named(tmp_path):
+    with pytest.raises(KroncError, match=r"kronc.json does not exist: expected a folder solved by"):
+        read_solution(tmp_path)
+    (tmp_path / "kronc.json").write_text("[]")
+    with pytest.raises(KroncError, match="expected an object"):
+        read_solution(tmp_path)
+
+
+def test_the_record_says_how_it_was_made(tmp_path, swapped_lap, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/somewhere/bin/kronc", "solve", "--data", "a b"])
+    record = json.loads((written(tmp_path / "out", *swapped_lap) / "kronc.json").read_text())
+    assert record["command"] == "kronc solve --data 'a b'"
+    assert record["versions"]["torch"] == version("torch")
+
+
+def test_points_and_left_out_views_are_told_without_the_rest(solved, solution):
+    known = solution.points[np.isfinite(solution.points).all(-1)]
+    np.testing.assert_allclose(solved_points(solved), known, atol=1e-12)
+    assert left_out_views(solved) == {solution.names[FAILED_VIEW].split("/")[-1]}
+
+
+@pytest.mark.parametrize(("read", "key"), [(solved_points, "points"), (left_out_views, "views")])
+def test_a_record_that_lacks_them_is_named(solved, edit, read, key):
+    edit(solved / "kronc.json", lambda record: record.pop(key))
+    with pytest.raises(KroncError, match=rf'kronc.json: expected "{key}", as .* writes them: solve again'):
+        read(solved)

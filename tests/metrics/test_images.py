@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from scipy.ndimage import gaussian_filter
 
 from kronc_ns.metrics.images import ImageMetrics, frame_metrics, mean_metrics, vehicle_metrics
@@ -12,18 +11,18 @@ from kronc_ns.metrics.images import ImageMetrics, frame_metrics, mean_metrics, v
 
 @pytest.fixture
 def truth():
-    return torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0))
+    return np.random.default_rng(0).random((48, 64, 3), dtype=np.float32)
 
 
 @pytest.fixture
 def rendered(truth):
-    noise = torch.randn(truth.shape, generator=torch.Generator().manual_seed(1))
-    return (truth + 0.1 * noise).clamp(0, 1)
+    noise = np.random.default_rng(1).standard_normal(truth.shape, dtype=np.float32)
+    return (truth + 0.1 * noise).clip(0, 1)
 
 
 @pytest.fixture
 def mask():
-    mask = torch.zeros(48, 64, dtype=torch.bool)
+    mask = np.zeros((48, 64), dtype=bool)
     mask[20:34, 24:44] = True
     return mask
 
@@ -48,9 +47,9 @@ def test_a_constant_difference_has_its_psnr(truth):
 
 
 def test_ssim_is_that_of_its_paper(rendered, truth, mask):
-    expected = similarity_map(rendered.double().numpy(), truth.double().numpy())
+    expected = similarity_map(rendered.astype(np.float64), truth.astype(np.float64))
     assert frame_metrics(rendered, truth).ssim == pytest.approx(expected.mean(), abs=1e-5)
-    assert vehicle_metrics(rendered, truth, mask).ssim == pytest.approx(expected[mask.numpy()].mean(), abs=1e-5)
+    assert vehicle_metrics(rendered, truth, mask).ssim == pytest.approx(expected[mask].mean(), abs=1e-5)
 
 
 def test_equal_images_differ_in_nothing(truth, mask):
@@ -59,15 +58,15 @@ def test_equal_images_differ_in_nothing(truth, mask):
 
 
 def test_of_a_mask_of_the_whole_frame_the_vehicle_is_the_frame(rendered, truth):
-    whole = vehicle_metrics(rendered, truth, torch.ones(48, 64, dtype=torch.bool))
+    whole = vehicle_metrics(rendered, truth, np.ones((48, 64), dtype=bool))
     frame = frame_metrics(rendered, truth)
     assert (whole.psnr, whole.ssim) == (pytest.approx(frame.psnr), pytest.approx(frame.ssim))
 
 
 def test_the_vehicle_knows_nothing_of_a_distant_background(rendered, truth, mask):
-    far = torch.ones(48, 64, dtype=torch.bool)
+    far = np.ones((48, 64), dtype=bool)
     far[14:40, 18:50] = False  # outside the reach of any window on the vehicle
-    other = torch.where(far[..., None], 1 - truth, rendered)
+    other = np.where(far[..., None], 1 - truth, rendered)
     alone, kept = vehicle_metrics(other, truth, mask), vehicle_metrics(rendered, truth, mask)
     assert (alone.psnr, alone.ssim) == (pytest.approx(kept.psnr), pytest.approx(kept.ssim))
     assert frame_metrics(other, truth).psnr < frame_metrics(rendered, truth).psnr - 3
@@ -78,21 +77,21 @@ def test_lpips_sees_the_vehicle_on_white(rendered, truth, mask):
 
     def lpips(*images):
         seen.append(images)
-        return torch.tensor(0.25)
+        return 0.25
 
     assert frame_metrics(rendered, truth, lpips).lpips == 0.25
     assert vehicle_metrics(rendered, truth, mask, lpips).lpips == 0.25
     (frame, _), (vehicle, photo) = seen
     assert frame.shape == vehicle.shape == (1, 3, 48, 64)
-    torch.testing.assert_close(frame[0].movedim(0, -1), rendered)
+    np.testing.assert_array_equal(np.moveaxis(frame[0], 0, -1), rendered)
     for image, source in ((vehicle, rendered), (photo, truth)):
-        image = image[0].movedim(0, -1)
-        torch.testing.assert_close(image[mask], source[mask])
+        image = np.moveaxis(image[0], 0, -1)
+        np.testing.assert_array_equal(image[mask], source[mask])
         assert (image[~mask] == 1).all()
 
 
 def test_an_empty_mask_has_no_vehicle(rendered, truth, mask):
-    assert vehicle_metrics(rendered, truth, torch.zeros_like(mask)) is None
+    assert vehicle_metrics(rendered, truth, np.zeros_like(mask)) is None
 
 
 def test_means_are_of_decibels_and_need_every_lpips():

@@ -1,4 +1,5 @@
 """Adam for millions of grid points."""
+# shapes unchecked: nerfstudio's own default of weight_decay, a float, is an int
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -14,11 +14,11 @@ import pytest
 
 from kronc_ns.capture.detection import environment
 from kronc_ns.capture.detection.choice import DetectorOptions
-from kronc_ns.capture.detection.conversion import ConvertDetector
 from kronc_ns.capture.detection.detector import CarImage, Detector
 from kronc_ns.capture.detection.environment import find_environment
 from kronc_ns.capture.detection.model import file_sha256
 from kronc_ns.capture.detection.pifpaf import OpenPifPafDetector
+from kronc_ns.commands.convert_detector import ConvertDetector
 from kronc_ns.errors import KroncError
 from kronc_ns.keypoints.schema import APOLLOCAR3D_24, APOLLOCAR3D_66
 from tests.capture.detection.dots import composite_net, draw, save

@@ -1,4 +1,4 @@
-"""`kronc bench`: measure the tables on this machine."""
+"""`kronc bench`."""
 
 import json
 import os
@@ -6,13 +6,10 @@ import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
-from rich.console import Console
 from typing_extensions import assert_never
 
-from kronc_ns.commands.console import progress_bar
 from kronc_ns.errors import KroncError
 
 if TYPE_CHECKING:
@@ -48,12 +45,14 @@ class Bench:
 
     def run(self) -> int:
         """Measure and print; status 0 also where a row misses what is asked."""
-        # a second of imports that no other command needs
+        self._check()
+        from rich.console import Console
+
         from kronc_ns.benchmark.problems import Options, Shapes, load_shapes
         from kronc_ns.benchmark.rows import hardware, measure_rows
         from kronc_ns.benchmark.table import rows_table
+        from kronc_ns.commands.console import progress_bar
 
-        self._check()
         shapes = Shapes() if self.shapes is None else load_shapes(self.shapes)
         options = Options(shapes, self.first_seed, self.adam_seeds or 0, self.scenes)
         workers = 1
@@ -99,6 +98,8 @@ class Bench:
 
     def _trainings(self, stack: ExitStack) -> "Trainings":
         """What the rows of nvs are made of; ``stack`` ends its commands and deletes what is not to be kept."""
+        from tempfile import TemporaryDirectory
+
         from kronc_ns.benchmark.commands import Commands
         from kronc_ns.benchmark.nvs_measures import Trainings
 
