@@ -56,9 +56,7 @@ def transforms_dict(
 
 def camera_and_frames(content: Any, file: Path) -> tuple[Camera, list[dict[str, Any]]]:
     """The shared camera and the frames of a nerfstudio transforms file."""
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):
-        raise KroncError(f'{file}: expected "frames", a list of objects with "file_path", as nerfstudio writes it')
+    frames = _frames(content, file)
     if not frames:
         raise KroncError(f"{file}: no frames: expected at least 3 views")
     twice = [name for name, count in Counter(str(f["file_path"]) for f in frames).items() if count > 1]
@@ -91,11 +89,7 @@ def camera_and_frames(content: Any, file: Path) -> tuple[Camera, list[dict[str, 
 
 def read_poses(file: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
     """Camera-to-world poses (OpenCV axes) by ``file_path``, of the frames that have one, from a transforms file."""
-    content = read_json(file)
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):
-        raise KroncError(f'{file}: expected "frames", a list of objects with "file_path", as nerfstudio writes it')
-    posed = [frame for frame in frames if frame.get("transform_matrix") is not None]
+    posed = [frame for frame in _frames(read_json(file), file) if frame.get("transform_matrix") is not None]
     return {str(frame["file_path"]): _pose(frame, file) for frame in posed}
 
 
@@ -104,6 +98,13 @@ def given_poses(frames: list[dict[str, Any]], file: Path) -> Float[np.ndarray, "
     if not all(frame.get("transform_matrix") is not None for frame in frames):
         return None
     return np.stack([_pose(frame, file) for frame in frames])
+
+
+def _frames(content: Any, file: Path) -> list[dict[str, Any]]:
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):
+        raise KroncError(f'{file}: expected "frames", a list of objects with "file_path", as nerfstudio writes it')
+    return frames
 
 
 def _pose(frame: dict[str, Any], file: Path) -> Float[np.ndarray, "3 4"]:

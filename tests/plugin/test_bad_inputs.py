@@ -32,8 +32,9 @@ SMALL = {
     "kronc_tensorf_cpu": {"upsampling_iters": (10, 20), "init_resolution": 16, "final_resolution": 24},
     "kronc_dvgo_cpu": {"coarse_iterations": 60, "coarse_voxels": 16**3, "fine_voxels": 24**3, "growth_steps": (10,)},
 }
+RAYS = 512
 OF_VIEWS = ["views", "initial_c2w"]
-STEPS = {"kronc_splatfacto_cpu": 40, "kronc_tensorf_cpu": 40, "kronc_dvgo_cpu": 80}
+STEPS = {"kronc_splatfacto_cpu": 60, "kronc_tensorf_cpu": 40, "kronc_dvgo_cpu": 80}
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +88,8 @@ def train(method: str, data: Path, out: Path, parser=None, model=None, steps=Non
     config.data = manager.data = manager.dataparser.data = data
     for name, value in ({"eval_interval": 4} | (parser or {})).items():
         setattr(manager.dataparser, name, value)
+    if hasattr(manager, "train_num_rays_per_batch"):
+        manager.train_num_rays_per_batch = RAYS
     for name, value in (model or {}).items():
         assert hasattr(config.pipeline.model, name)
         setattr(config.pipeline.model, name, value)

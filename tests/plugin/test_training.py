@@ -17,6 +17,7 @@ from tests.plugin.commands import InProcess, add_half_size, evaluate
 
 pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 METHOD = "kronc-tensorf-cpu"
+RAYS = ["--pipeline.datamanager.train-num-rays-per-batch", "256"]
 HALF = ["--downscale-factor", "2"]
 ONE_THREAD = Commands({"OMP_NUM_THREADS": "1"})
 
@@ -25,12 +26,12 @@ ONE_THREAD = Commands({"OMP_NUM_THREADS": "1"})
 def trained(tmp_path_factory):
     """The config of a short training on the solved poses of a rendered walk, and its data set."""
     root = tmp_path_factory.mktemp("training")
-    capture = make_capture("walk", views=32, seed=3, noise_px=0.67, camera=default_camera("walk", 320))
+    capture = make_capture("walk", views=32, seed=3, noise_px=0.67, camera=default_camera("walk", 160))
     write_capture(root / "capture", capture, render=True)
     add_half_size(root / "capture")
     data = root / "solved"
     write_variant(data, root / "capture", "solved", load_config("phone_walk"), capture.points)
-    return train(data, METHOD, root / "runs", ["--max-num-iterations", "500"], HALF, ONE_THREAD), data
+    return train(data, METHOD, root / "runs", ["--max-num-iterations", "500", *RAYS], HALF, ONE_THREAD), data
 
 
 def test_training_on_solved_poses_shows_the_car(trained):
