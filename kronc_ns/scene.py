@@ -13,7 +13,7 @@ from kronc_ns.keypoints.schema import KeypointSchema
 
 @dataclass(frozen=True)
 class Scene:
-    """N views of one object by one camera, with J keypoints; immutable, made by `files.scene_folder.load_scene` or by hand."""
+    """N views of one object by one camera, with J keypoints; immutable, made by `load_scene` or by hand."""
 
     names: tuple[str, ...]
     """``file_path`` of each view, relative to the folder, in capture order."""

@@ -4,13 +4,12 @@ No solver to use (it is told the answer), but the yardstick for those that are n
 """
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
-from torch import Tensor
 
 from kronc_ns.geometry.camera import project
+from kronc_ns.geometry.poses import make_pose
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.scene import Scene
 
@@ -18,28 +17,25 @@ _OUTLIER_PX = 2.0  # residuals well above this count linearly (soft L1)
 
 
 def maximum_likelihood(
-    scene: Scene, c2w: Float[Tensor, "n 3 4"], points: Float[Tensor, "j 3"], robust: bool
-) -> Float[Tensor, "n 3 4"]:
+    scene: Scene, c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"], robust: bool
+) -> Float[np.ndarray, "n 3 4"]:
     """Poses that minimise the squared (``robust``: soft L1) reprojection error, from the true poses and points."""
-    n, j = scene.visibility.shape
-    view, keypoint = torch.nonzero((scene.visibility > 0) & (scene.visibility.sum(0) > 1), as_tuple=True)
+    n, j = scene.seen.shape
+    view, keypoint = np.nonzero(scene.seen & (scene.seen.sum(0) > 1))
     uv = scene.uv[view, keypoint]
 
-    def unpack(flat: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-        x = torch.from_numpy(flat)
-        step, moved = x[: 6 * n].view(n, 6), x[6 * n :].view(j, 3)
-        return c2w[..., :3] @ so3_exp(step[:, :3]), c2w[..., 3] + step[:, 3:], points + moved
+    def unpack(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        step, moved = flat[: 6 * n].reshape(n, 6), flat[6 * n :].reshape(j, 3)
+        return make_pose(c2w[..., :3] @ so3_exp(step[:, :3]), c2w[..., 3] + step[:, 3:]), points + moved
 
     def residuals(flat: np.ndarray) -> np.ndarray:
-        rotation, centre, world = unpack(flat)
-        in_camera = ((world[keypoint] - centre[view])[:, None] @ rotation[view])[:, 0]
-        return (project(in_camera, scene.camera) - uv).flatten().numpy()
+        poses, world = unpack(flat)
+        in_camera = ((world[keypoint] - poses[view, :, 3])[:, None] @ poses[view, :, :3])[:, 0]
+        return (project(in_camera, scene.camera) - uv).ravel()
 
     row = np.arange(2 * len(view)).reshape(-1, 2, 1)
-    columns = np.concatenate(
-        [6 * view.numpy()[:, None] + np.arange(6), 6 * n + 3 * keypoint.numpy()[:, None] + np.arange(3)], axis=1
-    )[:, None]
-    row, columns = (np.broadcast_to(x, (len(view), 2, 9)).ravel() for x in (row, columns))
+    columns = np.concatenate([6 * view[:, None] + np.arange(6), 6 * n + 3 * keypoint[:, None] + np.arange(3)], axis=1)
+    row, columns = (np.broadcast_to(x, (len(view), 2, 9)).ravel() for x in (row, columns[:, None]))
     pattern = csr_matrix((np.ones(len(row), dtype=np.int8), (row, columns)), shape=(2 * len(view), 6 * n + 3 * j))
     found = least_squares(
         residuals,
@@ -51,5 +47,4 @@ def maximum_likelihood(
         max_nfev=20,
         tr_solver="lsmr",
     )
-    rotation, centre, _ = unpack(found.x)
-    return torch.cat([rotation, centre[..., None]], dim=-1)
+    return unpack(found.x)[0]

@@ -15,7 +15,7 @@ LAYERS = [
     {"commands", "plugin", "benchmark"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
-MAY_USE_TORCH = ("solve/adam", "solve/batched", "solve/objective", "plugin", "capture", "benchmark", "metrics/images")
+MAY_USE_TORCH = ("solve/adam", "solve/batched", "solve/tensors", "solve/objective", "plugin", "capture", "benchmark", "metrics/images")
 FILES = sorted(file for file in PACKAGE.rglob("*.py") if file != PACKAGE / "__init__.py")
 
 

@@ -21,8 +21,9 @@ def with_peak(run: Callable[[], Result]) -> tuple[Result, float]:
     if sys.platform != "linux":
         return run(), math.nan
     gc.collect()
-    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
-        trim(0)  # the allocator would otherwise hand out memory that was freed before, unseen
+    library = ctypes.CDLL(None)
+    if hasattr(library, "malloc_trim"):
+        library.malloc_trim(0)  # the allocator would otherwise hand out memory that was freed before, unseen
     try:
         (_PROCESS / "clear_refs").write_text("5")  # the peak starts from now
     except OSError:

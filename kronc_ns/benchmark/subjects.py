@@ -1,11 +1,11 @@
 """Captures whose true poses are known, and what is done to them before they are solved."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import torch
+import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from kronc_ns.errors import KroncError
 from kronc_ns.files.scene_folder import load_scene
@@ -28,18 +28,18 @@ class Subject:
 
     name: str
     scene: Scene
-    truth: Float[Tensor, "n 3 4"]
+    truth: Float[np.ndarray, "n 3 4"]
     folder: Path | None = None
     """Where its images are; None where it was never rendered."""
 
     @property
-    def points(self) -> Float[Tensor, "j 3"]:
+    def points(self) -> Float[np.ndarray, "j 3"]:
         """Keypoints where true poses and detections see them; NaN where fewer than two views do."""
         points = triangulate(self.truth, rays(self.scene.uv, self.scene.camera), self.scene.visibility)
-        return torch.where((self.scene.visibility.sum(0) >= 2)[:, None], points, torch.nan)
+        return np.where((self.scene.seen.sum(0) >= 2)[:, None], points, math.nan)
 
 
-def capture_scene(capture: Capture, given: Float[Tensor, "n 3 4"] | None = None) -> Scene:
+def capture_scene(capture: Capture, given: Float[np.ndarray, "n 3 4"] | None = None) -> Scene:
     """A synthetic capture as a scene in memory."""
     names = tuple(f"images/frame_{i + 1:05d}.png" for i in range(len(capture.c2w)))
     return Scene(names, capture.camera, APOLLOCAR3D_66, capture.keypoints, given)
@@ -59,50 +59,49 @@ def from_folder(folder: Path) -> Subject:
     if not (folder / "reference.json").is_file():
         raise KroncError(f"{folder}: expected a scene folder with the true poses in reference.json")
     scene, reference = load_scene(folder), read_poses(folder / "reference.json")
-    known = torch.tensor([name in reference for name in scene.names])
+    known = np.array([name in reference for name in scene.names])
     scene = chosen_views(scene, known)
     if len(scene) < 3:
         raise KroncError(f"{folder}: {len(scene)} views of keypoints.json are in reference.json, expected at least 3")
-    truth = torch.stack([reference[name] for name in scene.names])
+    truth = np.stack([reference[name] for name in scene.names])
     return _in_metres(Subject(folder.resolve().name, replace(scene, given_c2w=None), truth, folder))
 
 
 def _in_metres(subject: Subject) -> Subject:
     """A reference in which the car has no car's size, such as a COLMAP model, scaled by what cars measure."""
     template, points = car_template(subject.scene.schema), subject.points
-    if template is None or int(points.isfinite().all(-1).sum()) < 3:
+    if template is None or np.isfinite(points).all(-1).sum() < 3:
         return subject
     scale = template_frame(points, template).scale
     if 1 / _UNLIKE_A_CAR < scale < _UNLIKE_A_CAR:
         return subject
-    truth = subject.truth.clone()
+    truth = subject.truth.copy()
     truth[..., 3] *= scale
     return replace(subject, truth=truth)
 
 
-def with_noise(subject: Subject, noise_px: float, seed: int) -> Subject:
+def with_noise(subject: Subject, noise_px: float, rng: np.random.Generator) -> Subject:
     """Detections with normal noise, ``noise_px`` of standard deviation along each axis."""
-    generator = torch.Generator().manual_seed(seed)
-    keypoints = subject.scene.keypoints.clone()
-    noise = torch.randn(keypoints[..., :2].shape, generator=generator, dtype=keypoints.dtype)
-    keypoints[..., :2] += noise_px * noise * (keypoints[..., 2:] > 0)
-    return replace(subject, scene=replace(subject.scene, keypoints=keypoints))
+    scene = subject.scene
+    keypoints = scene.keypoints.copy()
+    keypoints[..., :2] += noise_px * rng.normal(size=scene.uv.shape) * scene.seen[..., None]
+    return replace(subject, scene=replace(scene, keypoints=keypoints))
 
 
 def thinned(subject: Subject, views: int) -> Subject:
     """So many of the views, evenly spread over a capture in which the first follows the last, as on a lap."""
     if not 3 <= views <= len(subject.truth):
         raise KroncError(f"{views} views of {subject.name}: expected 3 to {len(subject.truth)}")
-    keep = torch.zeros(len(subject.truth), dtype=torch.bool)
-    keep[torch.arange(views) * len(keep) // views] = True
+    keep = np.zeros(len(subject.truth), dtype=bool)
+    keep[np.arange(views) * len(keep) // views] = True
     return replace(subject, scene=chosen_views(subject.scene, keep), truth=subject.truth[keep])
 
 
-def chosen_views(scene: Scene, keep: Bool[Tensor, "n"]) -> Scene:
+def chosen_views(scene: Scene, keep: Bool[np.ndarray, "n"]) -> Scene:
     """The scene of the views in ``keep``."""
 
     def names(of: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(name for name, kept in zip(of, keep.tolist(), strict=True) if kept)
+        return tuple(name for name, kept in zip(of, keep, strict=True) if kept)
 
     return replace(
         scene,

@@ -1,12 +1,12 @@
 """Are the poses good enough to train on? The same training on solved, exact and unoptimised poses."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import torch
+import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
 from kronc_ns.benchmark.commands import Commands
 from kronc_ns.files.output import claim_output
@@ -15,6 +15,7 @@ from kronc_ns.files.scene_folder import load_scene
 from kronc_ns.files.transforms import read_poses
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
+from kronc_ns.geometry.poses import posed
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
 
@@ -26,7 +27,7 @@ def write_variant(
     data: Path,
     which: Poses,
     config: KroncConfig,
-    points: Float[Tensor, "j 3"],
+    points: Float[np.ndarray, "j 3"],
     keypoints: Path | None = None,
 ) -> None:
     """A data set of the rendered capture ``data`` with one kind of poses, ready for `kronc-dataparser`.
@@ -41,7 +42,7 @@ def write_variant(
         write_solution(folder, scene, solve_scene(scene, config), data, inputs=which)
         return
     reference = read_poses(data / "reference.json")
-    c2w = torch.stack([reference[name] for name in scene.names])
+    c2w = np.stack([reference[name] for name in scene.names])
     if which == "given":
         assert scene.given_c2w is not None
         c2w = scene.given_c2w
@@ -49,17 +50,16 @@ def write_variant(
 
 
 def write_poses(
-    folder: Path, data: Path, scene: Scene, c2w: Float[Tensor, "n 3 4"], points: Float[Tensor, "j 3"]
+    folder: Path, data: Path, scene: Scene, c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"]
 ) -> None:
     """A data set of the capture ``data`` with poses that came from elsewhere; NaN where a view has none.
 
     ``points`` are the keypoints in the world of the poses: they say where the car is.
     """
     claim_output(folder)
-    posed = c2w.isfinite().all(-1).all(-1).tolist()
     views = tuple(
         ViewReport(name, ViewStatus.SOLVED if ok else ViewStatus.FAILED, 0, 0, None)
-        for name, ok in zip(scene.names, posed, strict=True)
+        for name, ok in zip(scene.names, posed(c2w), strict=True)
     )
     solution = Solution(
         status=Status.CONVERGED,
@@ -68,15 +68,15 @@ def write_poses(
         camera=scene.camera,
         c2w=c2w,
         points=points,
-        depths=torch.full(scene.visibility.shape, float("nan"), dtype=torch.float64),
+        depths=np.full(scene.visibility.shape, math.nan),
         views=views,
         initial_c2w=c2w,
         solver="none",
         init="given",
         iterations=0,
         seconds=0.0,
-        rmse_px=float("nan"),
-        median_px=float("nan"),
+        rmse_px=math.nan,
+        median_px=math.nan,
     )
     write_solution(folder, scene, solution, data, inputs="poses from elsewhere")
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
 
-from kronc_ns.commands.console import progress_bar
+from kronc_ns.commands.console import solving
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import fingerprint
 from kronc_ns.files.output import claim_output
@@ -80,7 +80,7 @@ def solve_folders(
     if inside:
         raise KroncError(f"--output-dir {output_dir} holds the scene {inside[0]} itself: choose another folder")
     outcomes: list[Outcome] = []
-    with progress_bar("scenes") as progress:
+    with solving("scenes") as progress:
         for first in range(0, len(folders), _TOGETHER):
             outcomes += _solve_some(folders[first : first + _TOGETHER], output_dir, config, depth_weights)
             progress(len(outcomes), len(folders), None)

@@ -62,6 +62,17 @@ def _fail(message: str, status: int) -> int:
 
 
 @contextmanager
+def solving(description: str = "solving") -> Iterator[Callable[[int, int, float | None], None]]:
+    """`progress_bar` of something that solves; says so where the solver is compiled first."""
+    from kronc_ns.solve.lm import is_ready
+
+    if not is_ready():
+        print("compiling the solver for this machine, once (about 10 s)", file=sys.stderr)
+    with progress_bar(description) as progress:
+        yield progress
+
+
+@contextmanager
 def progress_bar(description: str) -> Iterator[Callable[[int, int, float | None], None]]:
     """A bar on stderr with time left; the callback takes (step, steps, loss or None)."""
     from rich.console import Console

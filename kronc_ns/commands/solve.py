@@ -28,7 +28,7 @@ class Solve(SolverOptions):
         from rich.console import Console
 
         from kronc_ns.commands.batch import add_depths, expand, solve_folders
-        from kronc_ns.commands.console import exit_status, progress_bar, report_table
+        from kronc_ns.commands.console import exit_status, progress_bar, report_table, solving
         from kronc_ns.files.cache import fingerprint
         from kronc_ns.files.output import claim_output
         from kronc_ns.files.record import write_solution
@@ -47,7 +47,7 @@ class Solve(SolverOptions):
         with progress_bar("estimating depths") as progress:
             scene = add_depths(scene, folders[0], config, self.depth_weights, progress)
         claim_output(self.output_dir)
-        with progress_bar("solving") as progress:
+        with solving() as progress:
             solution = solve_scene(scene, config, progress)
         report = write_solution(self.output_dir, scene, solution, folders[0], fingerprint(scene, config))
         Console().print(report_table(report, scene.notes))

@@ -9,7 +9,7 @@ from typing import Any
 
 import kronc_ns
 
-_PACKAGES = ("torch", "numpy", "nerfstudio")
+_PACKAGES = ("numpy", "numba", "torch", "nerfstudio")
 
 
 def provenance() -> dict[str, Any]:

@@ -32,7 +32,7 @@ from kronc_ns.geometry.camera import rays
 from kronc_ns.geometry.poses import camera_z, posed
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.scene import Scene
-from kronc_ns.solution import Solution, Status, ViewStatus
+from kronc_ns.solution import Solution, Status
 from kronc_ns.solve.threads import side_by_side
 
 _TOGETHER = 256  # scenes in a batch on a GPU
@@ -101,9 +101,9 @@ def _solve_some(scenes: Sequence[Scene], config: KroncConfig, progress: Progress
 def _check(scene: Scene, config: KroncConfig) -> None:
     """Raise for options that this scene or machine cannot meet."""
     if config.device == "cuda":
-        import torch
+        from kronc_ns.solve.batched import gpu_is_there  # seconds of torch's import
 
-        if not torch.cuda.is_available():
+        if not gpu_is_there():
             raise KroncError('device "cuda" was asked for, but torch finds no CUDA GPU: use "cpu" or "auto"')
     if config.init == "given" and scene.given_c2w is None:
         raise KroncError(

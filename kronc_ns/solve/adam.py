@@ -189,7 +189,9 @@ def minimise(
     device: Literal["auto", "cpu", "cuda"] = "auto",
     progress: Callable[[int, float], None] | None = None,
 ) -> AdamResult:
-    """Run Algorithm 1 from the given poses (c2w, OpenCV axes) and z-depths, in float32; auto takes a GPU if there is one.
+    """Run Algorithm 1 from the given poses (c2w, OpenCV axes) and z-depths, in float32.
+
+    ``device`` auto takes a GPU if there is one.
 
     ``uv`` are undistorted pixels, ``m`` the visibility. ``progress(step, loss)`` is called about a hundred times.
     """

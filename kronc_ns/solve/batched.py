@@ -1,4 +1,4 @@
-"""`lm` for many scenes at once on tensors: for CUDA, where dispatch and not arithmetic costs. Same results, same records.
+"""`lm` for many scenes at once on tensors: for CUDA, where dispatch and not arithmetic costs. Same results and records.
 
 Scenes that converge leave the batch. Nothing on a CPU takes this path but the tests, which hold both solvers together.
 """
@@ -32,6 +32,11 @@ class _Search(Batched):
     cost: Float[Tensor, "b"]
     damping: Float[Tensor, "b"]
     rounds: Int[Tensor, "b"]
+
+
+def gpu_is_there() -> bool:
+    """Whether torch finds a CUDA GPU."""
+    return torch.cuda.is_available()
 
 
 def adjust_batch(

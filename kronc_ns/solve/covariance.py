@@ -10,11 +10,11 @@ W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T.
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from kronc_ns.solve import schur
 from kronc_ns.solve.compiled import compiled
-from kronc_ns.solve.linear import dot, factor, forward, inverse_factor
+from kronc_ns.solve.linear import dot, factor, forward
 from kronc_ns.solve.problem import Problem, State
 from kronc_ns.solve.threads import in_parts
 
@@ -43,38 +43,19 @@ def camera_covariance(
     schur.evaluate(data, now)
     work.weight[:] = data.own
     schur.reduce_system(data, now, work, _DAMPING, sigma_px**2 * shape_weight, sigma_px**2)
-    frame = _frame(now, data.joint, work.matrix[0])
-    if frame is None:
-        covariance[:] = np.nan
-    else:
-        in_parts(lambda part: _cameras(now, work, part, *frame, sigma_px**2, covariance), len(work.matrix))
-    return covariance
-
-
-@compiled
-def _frame(now: Any, joint: Any, matrix: Any) -> Any:
-    """What all cameras share: L^-1 G, G^T S^-1 G, and the matrix of `_gauge` and the mean. S becomes L.
-
-    None where S is not positive definite.
-    """
-    size = len(matrix)
-    gauge, inverse, mean = _gauge(now.points, joint, size)
-    stiffness = 0.0
-    for i in range(size):
-        stiffness += matrix[i, i] / size
-    for i in range(size):
-        for p in range(7):
-            part = stiffness * gauge[p, i]
-            for k in range(i + 1):
-                matrix[i, k] += part * gauge[p, k]
+    gauge, inverse, mean = _gauge(now.points, np.unique(data.joint), work.matrix.shape[-1])
+    matrix = work.matrix[0]
+    matrix += np.trace(matrix) / len(matrix) * (gauge.T @ gauge)
     if not factor(matrix):
-        return None
+        covariance[:] = np.nan
+        return covariance
     forward(matrix, gauge)
-    shared = np.empty((7, 7))
-    for p in range(7):
-        for q in range(7):
-            shared[p, q] = dot(gauge[p], gauge[q], size)
-    return gauge, shared, inverse, mean
+    shared = gauge @ gauge.T
+    in_parts(
+        lambda part: _cameras(now, work, part, gauge, shared, inverse, mean, sigma_px**2, covariance),
+        len(work.edges) - 1,
+    )
+    return covariance
 
 
 @compiled
@@ -89,41 +70,25 @@ def _cameras(
         _camera_covariance(r, t, mean, w, z, gauge, shared, inverse, variance, out[n])
 
 
-@compiled
-def _gauge(points: Any, joint: Any, size: int) -> Any:
-    """Orthonormal directions [12, P] in which shift, turn and growth of the world move the points that are seen.
+def _gauge(
+    points: Float[np.ndarray, "j 3"], seen: Int[np.ndarray, "s"], size: int
+) -> tuple[Float[np.ndarray, "12 p"], Float[np.ndarray, "7 7"], Float[np.ndarray, "3"]]:
+    """Orthonormal directions in which shift, turn and growth of the world move the points that are seen.
 
-    (The last five are 0, for `forward`.) Also the 7x7 matrix that makes them of the moves, and the points' mean.
+    (The last five are 0, for `forward`.) Also the matrix that makes them of the moves, and the points' mean.
     """
-    joints = len(points)
-    moves, square, inverse, mean = np.zeros((12, size)), np.empty((7, 7)), np.empty((7, 7)), np.zeros(3)
-    seen, count = np.zeros(joints), 0.0
-    for j in joint:
-        count += 1.0 - seen[j]
-        seen[j] = 1.0
-    for j in range(joints):
-        for c in range(3):
-            mean[c] += seen[j] * points[j, c] / max(count, 1.0)
-    for j in range(joints):
-        if seen[j] > 0.0:
-            x, y, z = points[j, 0] - mean[0], points[j, 1] - mean[1], points[j, 2] - mean[2]
-            for c in range(3):
-                moves[c, c * joints + j] = 1.0
-            moves[3, joints + j], moves[3, 2 * joints + j] = -z, y
-            moves[4, j], moves[4, 2 * joints + j] = z, -x
-            moves[5, j], moves[5, joints + j] = -y, x
-            moves[6, j], moves[6, joints + j], moves[6, 2 * joints + j] = x, y, z
-    for p in range(7):
-        for q in range(7):
-            square[p, q] = dot(moves[p], moves[q], size)
-        square[p, p] += _TRACE
-    inverse_factor(square, inverse)
-    for p in range(6, -1, -1):
-        for i in range(size):
-            moves[p, i] *= inverse[p, p]
-        for q in range(p):
-            for i in range(size):
-                moves[p, i] += inverse[p, q] * moves[q, i]
+    mean = points[seen].mean(0) if len(seen) else np.zeros(3)
+    arm = points[seen] - mean
+    turned = np.cross(np.eye(3)[:, None], arm)  # [axis of the turn, point, component]
+    moves = np.zeros((12, size))
+    for c in range(3):
+        at = c * len(points) + seen
+        moves[c, at] = 1.0
+        moves[3:6, at] = turned[..., c]
+        moves[6, at] = arm[:, c]
+    square = moves[:7] @ moves[:7].T + _TRACE * np.eye(7)
+    inverse = np.linalg.inv(np.linalg.cholesky(square))
+    moves[:7] = inverse @ moves[:7]
     return moves, inverse, mean
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from kronc_ns.solve import robust, schur
+from kronc_ns.solve.compiled import is_compiled
 from kronc_ns.solve.options import LmConfig
 from kronc_ns.solve.problem import Problem, State
 
@@ -92,6 +93,11 @@ def adjust(
         usual = robust.shape_weight(float(now.surprise[0]), problem.shape.freedom, len(problem.shape.mean))
     state = path[-1] if path else _state(now)
     return LmResult(state, cost / sigma**2, sigma, inlier, usual, done, tuple(losses), tuple(path))
+
+
+def is_ready() -> bool:
+    """Whether the compiled solver is there, in this process or on disk; else the first call compiles it."""
+    return is_compiled(schur.reduce_views)
 
 
 def _state(now: schur.Estimate) -> State:

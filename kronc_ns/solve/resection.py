@@ -207,7 +207,9 @@ def _refine(rows: Any, view: Any, w2c: Any, most: Any, steps: int, out: Any) -> 
                 trial[p, 3] += twist[3 + p]
             _see(rows, begin, count, trial, trial_seen, then)
             if cost(then, sigma, CAUCHY) < cost(now, sigma, CAUCHY):  # false for NaN
-                pose[:] = trial
+                for p in range(3):  # an assignment of arrays compiles the text of its errors, for two seconds
+                    for c in range(4):
+                        pose[p, c] = trial[p, c]
                 seen, trial_seen = trial_seen, seen
                 now, then = then, now
                 damping /= 10.0

@@ -196,20 +196,16 @@ def evaluate(data: Measured, now: Estimate) -> None:
         now.surprise[0] = total
 
 
-@compiled
-def total_cost(data: Measured, now: Estimate, sigma: float, phase: int) -> Any:
+def total_cost(data: Measured, now: Estimate, sigma: float, phase: int) -> float:
     """What is minimised, in squared pixels: detections and priors."""
     total = cost(now.length, sigma, phase)
     if len(data.mean) and not data.points_known:
         size = len(data.mean)
-        usual, rest = shape_excess(now.surprise[0], data.freedom, size)
-        total += sigma * sigma * (usual + (data.freedom + size) * np.log(rest))
-    for n in range(len(data.strength)):
-        square = 0.0
-        for c in range(3):
-            off = orbit_error(data, now, n, c)
-            square += off * off
-        total += sigma * sigma * data.strength[n] * square
+        usual, rest = shape_excess(float(now.surprise[0]), data.freedom, size)
+        total += sigma * sigma * (usual + (data.freedom + size) * math.log(rest))
+    if len(data.strength):
+        off = now.translation + (now.rotation @ data.centre[..., None])[..., 0]
+        total += sigma * sigma * float(data.strength @ np.square(off).sum(1))
     return total
 
 

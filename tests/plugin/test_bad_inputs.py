@@ -34,7 +34,10 @@ SMALL = {
 }
 RAYS = 512
 OF_VIEWS = ["views", "initial_c2w"]
-STEPS = {"kronc_splatfacto_cpu": 60, "kronc_tensorf_cpu": 40, "kronc_dvgo_cpu": 80}
+STEPS = {"kronc_splatfacto_cpu": 25, "kronc_tensorf_cpu": 25, "kronc_dvgo_cpu": 72}
+"""All that changes on the way has happened by then: images are densified, grids have grown."""
+LONGER = {"kronc_splatfacto_cpu": 60, "kronc_tensorf_cpu": 40, "kronc_dvgo_cpu": 80}
+"""What has been learned shows."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +61,7 @@ def rendered(tmp_path_factory) -> Callable[..., Path]:
 def plain_psnr(rendered, tmp_path_factory) -> Callable[[str], float]:
     """Test views of a pinhole camera with square pixels, trained once a method."""
     return functools.cache(
-        lambda method: train(method, rendered(), tmp_path_factory.mktemp("plain"), model=SMALL[method])["psnr"]
+        lambda method: train_longer(method, rendered(), tmp_path_factory.mktemp("plain"))["psnr"]
     )
 
 
@@ -104,6 +107,10 @@ def train(method: str, data: Path, out: Path, parser=None, model=None, steps=Non
     return trainer.pipeline.get_average_eval_image_metrics(step=config.max_num_iterations)
 
 
+def train_longer(method: str, data: Path, out: Path) -> dict[str, float]:
+    return train(method, data, out, model=SMALL[method], steps=LONGER[method])
+
+
 def first_views(folder: Path, count: int) -> None:
     """Keep only the first views of a data set."""
     for name, keys in (("transforms.json", ["frames"]), ("keypoints.json", ["frames"]), ("kronc.json", OF_VIEWS)):
@@ -120,7 +127,7 @@ def first_views(folder: Path, count: int) -> None:
     ids=["pixels that are not square", "barrel", "pincushion"],
 )
 def test_any_camera_trains_as_a_plain_one(method, camera, rendered, plain_psnr, tmp_path):
-    other = train(method, rendered(camera), tmp_path, model=SMALL[method])
+    other = train_longer(method, rendered(camera), tmp_path)
     assert other["psnr"] > plain_psnr(method) - 1.5
 
 
