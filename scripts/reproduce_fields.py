@@ -3,7 +3,7 @@
 
 import tyro
 
-from kronc_ns.benchmark.fields import FieldOptions, make_field_table
+from kronc_ns.benchmark.tables.fields import FieldOptions, make_field_table
 from kronc_ns.commands.console import exit_on_error
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
 
 import tyro
 
-from kronc_ns.benchmark.settings import by_noise
-from kronc_ns.benchmark.tables import TableOptions, make_table
+from kronc_ns.benchmark.tables.settings import by_noise
+from kronc_ns.benchmark.tables.table import TableOptions, make_table
 from kronc_ns.commands.console import exit_on_error
 
 if __name__ == "__main__":

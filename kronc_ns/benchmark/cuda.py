@@ -33,7 +33,7 @@ from kronc_ns.keypoints.template import car_template
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution
 from kronc_ns.solve.lm import adjust
-from kronc_ns.solve.problem import State
+from kronc_ns.solve.problem import Intrinsic, State
 
 _LIMIT_S = 480.0
 _SAME_DEG = 1e-6
@@ -84,7 +84,8 @@ def batched_against_compiled(options: Options) -> Figures:
     scenes = [capture(seed, options.views - 7 * seed)[0] for seed in range(6)]
     starts = [start_from_poses("given", "given", s, s.given_c2w) for s in scenes if s.given_c2w is not None]
     worst: Figures = {}
-    for name, refine in (("", ()), (" with focal length and k1", ("focal", "k1"))):
+    cases: dict[str, tuple[Intrinsic, ...]] = {"": (), " with focal length and k1": ("focal", "k1")}
+    for name, refine in cases.items():
         problems = [problem_of(start, refine) for start in starts]
         states = [State.of(start.c2w, start.points) for start in starts]
         ours = [adjust(problem, state).state.c2w for problem, state in zip(problems, states, strict=True)]

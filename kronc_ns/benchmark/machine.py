@@ -10,7 +10,7 @@ import numpy as np
 
 
 def hardware() -> dict[str, Any]:
-    """The machine, how busy it is, and what computes on it; of torch and the GPU it uses, where it has been imported."""
+    """The machine, how busy it is, and what computes on it; torch and its GPU only where it has been imported."""
     machine = {
         "cpu": _cpu(),
         "cores": os.cpu_count(),

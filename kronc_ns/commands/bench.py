@@ -13,7 +13,7 @@ from typing_extensions import assert_never
 from kronc_ns.errors import KroncError
 
 if TYPE_CHECKING:
-    from kronc_ns.benchmark.nvs_measures import Trainings
+    from kronc_ns.benchmark.suites.trainings import Trainings
 
 _MOST_TRAININGS = 4  # at a time, of one thread and about 1.5 GB each
 
@@ -32,11 +32,11 @@ class Bench:
     rows: str = ""
     """Only rows whose name holds this text."""
     shapes: Path | None = None
-    """JSON file of 66 keypoints of real cars for the rows without initial pose; those after the 40th are measured.
-    Default: random procedural cars."""
+    """JSON file of 66 keypoints of real cars for the rows without initial pose and those that look through cars; those
+    after the 40th are measured. Default: random procedural cars."""
     adam_seeds: int | None = None
     """On so many seeds 10,000 steps of Adam run beside (default: none in poses, 1 in speed); half a minute each."""
-    scenes: int = 200
+    scenes: int = 1000
     """Scenes of the throughput row."""
     keep: Path | None = None
     """Of nvs: new folder for the captures, trained runs and pictures of the test views (default: they are deleted)."""
@@ -48,9 +48,10 @@ class Bench:
         self._check()
         from rich.console import Console
 
-        from kronc_ns.benchmark.problems import Options, Shapes, load_shapes
-        from kronc_ns.benchmark.rows import hardware, measure_rows
-        from kronc_ns.benchmark.table import rows_table
+        from kronc_ns.benchmark.machine import hardware
+        from kronc_ns.benchmark.suites.captures import Options, Shapes, load_shapes
+        from kronc_ns.benchmark.suites.overview import in_a_line, overview
+        from kronc_ns.benchmark.suites.rows import measure_rows
         from kronc_ns.commands.console import progress_bar
 
         shapes = Shapes() if self.shapes is None else load_shapes(self.shapes)
@@ -59,40 +60,37 @@ class Bench:
         with ExitStack() as stack:
             match self.suite:
                 case "poses":
-                    from kronc_ns.benchmark.pose_rows import pose_tasks
+                    from kronc_ns.benchmark.suites.poses import pose_rows
 
-                    tasks = pose_tasks(options)
+                    rows = pose_rows(options)
                 case "speed":
-                    from kronc_ns.benchmark.speed_rows import speed_tasks
+                    from kronc_ns.benchmark.suites.speed import speed_rows
 
-                    tasks = speed_tasks(options)
+                    rows = speed_rows(options)
                 case "nvs":
-                    from kronc_ns.benchmark.nvs_rows import nvs_tasks
+                    from kronc_ns.benchmark.suites.nvs import nvs_rows
 
-                    tasks = nvs_tasks(self._trainings(stack))
+                    rows = nvs_rows(self._trainings(stack))
                     workers = min(len(os.sched_getaffinity(0)), _MOST_TRAININGS)
                 case _:
                     assert_never(self.suite)
-            chosen = [task for task in tasks if self.rows.lower() in task.name.lower()]
+            chosen = [row for row in rows if self.rows.lower() in row.name.lower()]
             if not chosen:
-                names = "; ".join(task.name for task in tasks)
+                names = "; ".join(row.name for row in rows)
                 raise KroncError(f"--rows {self.rows!r}: expected part of one of {names}")
-            machine = hardware()
+            before = hardware()
             measured = []
             with progress_bar(self.suite) as progress:
-                rows = measure_rows(chosen, self.first_seed, self.seeds, lambda _, i, n: progress(i, n, None), workers)
-                for row in rows:
+                report = lambda _, i, n: progress(i, n, None)  # noqa: E731
+                for row in measure_rows(chosen, self.first_seed, self.seeds, report, workers):
                     measured.append(row)
-                    verdict = {True: "reached", False: "missed", None: "measured"}[row.passed]
-                    figures = ", ".join(f"{name} {value:.4g}" for name, value in row.reached.items())
-                    print(f"{verdict}: {row.name} ({row.seconds:.1f} s): {figures}", file=sys.stderr)
+                    print(in_a_line(row), file=sys.stderr)
+        machine = {**hardware(), **before}  # busy as it was, with the libraries that came since
         if self.json:
             content = {"suite": self.suite, "hardware": machine, "rows": [row.as_dict() for row in measured]}
             print(json.dumps(content, allow_nan=False))
             return 0
-        asked = [row for row in measured if row.passed is not None]
-        title = f"{self.suite}: {sum(bool(row.passed) for row in asked)} of {len(asked)} rows reached"
-        Console().print(rows_table(measured, title))
+        Console().print(overview(self.suite, measured).on_terminal())
         print(", ".join(f"{name} {value}" for name, value in machine.items()))
         return 0
 
@@ -101,7 +99,7 @@ class Bench:
         from tempfile import TemporaryDirectory
 
         from kronc_ns.benchmark.commands import Commands
-        from kronc_ns.benchmark.nvs_measures import Trainings
+        from kronc_ns.benchmark.suites.trainings import Trainings
 
         folder = self.keep
         if folder is None:

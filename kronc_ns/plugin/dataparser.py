@@ -109,20 +109,18 @@ class KroncDataParser(DataParser):
         everyone = solved_views(config.data, scene, solution, test)
         level = image_level(everyone.images[0], (camera.width, camera.height), config.downscale_factor)
         views = everyone.of_split(split).at_level(level)
-        if views.masks is not None and config.background != "keep":
-            check_masks(views.masks)
+        images, masks = self._images(views)
         points = solution.points[np.isfinite(solution.points).all(-1)]
         world = world_around(points, everyone.c2w[everyone.posed], config.scene_scale, config.scale_factor)
         seeds = grey(points)
         if split == "train":  # models start from the training views' metadata
             seeds += self._seeds(views, camera, world.box)
-        cut = config.background == "white" and views.masks is not None
         return DataparserOutputs(
-            image_filenames=cut_out(views.images, views.masks) if cut else list(views.images),
+            image_filenames=images,
             cameras=_cameras(world.of_poses(views.c2w), camera, level),
             alpha_color=None if config.background == "keep" else torch.ones(3),
             scene_box=SceneBox(aabb=_tensor(world.of_points(world.box))),
-            mask_filenames=list(views.masks) if config.background == "mask" and views.masks is not None else None,
+            mask_filenames=masks,
             dataparser_transform=torch.cat([torch.eye(3), -_tensor(world.centre)[:, None]], dim=1),
             dataparser_scale=world.scale,
             metadata={
@@ -131,14 +129,20 @@ class KroncDataParser(DataParser):
             },
         )
 
+    def _images(self, views: SolvedViews) -> tuple[list[Path], list[Path] | None]:
+        """The files of the images and masks to train on, as the background is to be treated."""
+        if views.masks is None or self.config.background == "keep":
+            return list(views.images), None
+        check_masks(views.masks)
+        if self.config.background == "mask":
+            return list(views.images), list(views.masks)
+        return cut_out(views.images, views.masks), None
+
     def _seeds(self, views: SolvedViews, camera: Camera, box: Float[np.ndarray, "2 3"]) -> Seeds:
         """Points to start from, in the solved world: the visual hull, or else random points."""
-        count, full_frame = self.config.num_seed_points, self.config.background == "keep"
-        ground = ground_seeds(box, views.c2w, count // 2)
-        if views.masks is None:
-            return box_seeds(box, count) + ground
+        count = self.config.num_seed_points
         car = box_seeds(box, count)
-        if self.config.seeds == "hull":
+        if views.masks is not None and self.config.seeds == "hull":
             hull = carve(read_pictures(views.images, views.masks, camera), views.c2w, box, count)
             if len(hull.points):
                 car = hull
@@ -146,7 +150,9 @@ class KroncDataParser(DataParser):
                 CONSOLE.print(
                     "[yellow]the masks leave nothing of the car in its box: starting from random points[/yellow]"
                 )
-        return car + ground if full_frame else car
+        if views.masks is not None and self.config.background != "keep":
+            return car
+        return car + ground_seeds(box, views.c2w, count // 2)
 
 
 def _cameras(c2w: Float[np.ndarray, "n 3 4"], camera: Camera, level: int) -> Cameras:

@@ -19,6 +19,7 @@ from kronc_ns.solve.problem import Problem, State
 from kronc_ns.solve.threads import in_parts
 
 _TRACE = 1e-9  # of the gauge's directions, where points are too few to tell them apart
+_PARTS, _MANY = 2, 32  # from so many cameras on they are computed in parts, one for each core
 _DAMPING = 1e-9  # keeps the gauge's zero pivots positive
 
 
@@ -43,29 +44,42 @@ def camera_covariance(
     schur.evaluate(data, now)
     work.weight[:] = data.own
     schur.reduce_system(data, now, work, _DAMPING, sigma_px**2 * shape_weight, sigma_px**2)
-    gauge, inverse, mean = _gauge(now.points, np.unique(data.joint), work.matrix.shape[-1])
-    matrix = work.matrix[0]
+    matrix = work.matrix
+    gauge, inverse, mean = _gauge(now.points, np.unique(data.joint), len(matrix))
     matrix += np.trace(matrix) / len(matrix) * (gauge.T @ gauge)
     if not factor(matrix):
         covariance[:] = np.nan
         return covariance
     forward(matrix, gauge)
     shared = gauge @ gauge.T
+    parts = _PARTS if len(covariance) >= _MANY else 1
+    edges = np.linspace(0, len(covariance), parts + 1).astype(int).tolist()
     in_parts(
-        lambda part: _cameras(now, work, part, gauge, shared, inverse, mean, sigma_px**2, covariance),
-        len(work.edges) - 1,
+        lambda part: _cameras(
+            now, work, edges[part], edges[part + 1], gauge, shared, inverse, mean, sigma_px**2, covariance
+        ),
+        parts,
     )
     return covariance
 
 
 @compiled
 def _cameras(
-    now: Any, work: Any, part: int, gauge: Any, shared: Any, inverse: Any, mean: Any, variance: float, out: Any
+    now: Any,
+    work: Any,
+    begin: int,
+    end: int,
+    gauge: Any,
+    shared: Any,
+    inverse: Any,
+    mean: Any,
+    variance: float,
+    out: Any,
 ) -> None:
-    """The covariances of the cameras in a part."""
-    for n in range(work.edges[part], work.edges[part + 1]):
+    """The covariances of some cameras."""
+    for n in range(begin, end):
         z = work.whitened[n]
-        forward(work.matrix[0], z)
+        forward(work.matrix, z)
         r, t, w = now.rotation[n], now.translation[n], work.whitener[n]
         _camera_covariance(r, t, mean, w, z, gauge, shared, inverse, variance, out[n])
 

@@ -97,7 +97,7 @@ def adjust(
 
 def is_ready() -> bool:
     """Whether the compiled solver is there, in this process or on disk; else the first call compiles it."""
-    return is_compiled(schur.reduce_views)
+    return is_compiled(schur.reduce_system)
 
 
 def _state(now: schur.Estimate) -> State:

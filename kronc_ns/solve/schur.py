@@ -25,14 +25,11 @@ from kronc_ns.solve.projection import (
     plane_by_turn,
 )
 from kronc_ns.solve.robust import cost, shape_excess, shape_weight, weigh
-from kronc_ns.solve.threads import in_parts
 
 Array = NDArray[Any]
 
 TINY = 1e-12
 """Diagonal entries up to this say nothing; their unknowns stay where they are."""
-_PARTS, _MANY = 2, 1000
-"""Scenes of so many detections are reduced in parts, on two cores; the same parts on one, for the same result."""
 
 
 class Measured(NamedTuple):
@@ -96,18 +93,14 @@ class System(NamedTuple):
     """[N, 6, 6]: inverse Cholesky factors of the cameras' blocks"""
     whitened: Array
     """[N, 6, P + 1], zeros: cameras against other unknowns, and their gradient; [0, ...] if not wanted"""
-    edges: Array
-    """[S + 1]: the first view of each part, which is reduced by itself"""
     matrix: Array
-    """[S, P, P], lower triangles; the whole system is in the first, once reduced"""
+    """[P, P], lower triangle"""
     rhs: Array
-    """[S, P]; in the first the change of the unknowns, once solved"""
-    diagonal: Array
-    """[S, P] of the normal equations"""
+    """[P]; the change of the unknowns, once solved"""
 
 
 def measured(problem: Problem) -> Measured:
-    """A problem with its detections in a row."""
+    """A problem with its detections in a row, contiguous as all arrays: other strides would be compiled anew."""
     view, joint = np.nonzero(problem.weight > 0)
     views = len(problem.weight)
     first = np.zeros(views + 1, np.int64)
@@ -115,14 +108,14 @@ def measured(problem: Problem) -> Measured:
     shape, orbit = problem.shape, problem.orbit
     return Measured(
         first,
-        joint,
+        np.ascontiguousarray(joint),
         np.ascontiguousarray(problem.uv[view, joint].T),
         problem.weight[view, joint],
         np.array(problem.focal),
-        np.empty(0) if shape is None else shape.mean,
-        np.empty((0, 0)) if shape is None else shape.precision,
+        np.empty(0) if shape is None else np.ascontiguousarray(shape.mean),
+        np.empty((0, 0)) if shape is None else np.ascontiguousarray(shape.precision),
         1.0 if shape is None else shape.freedom,
-        np.empty((0, 3)) if orbit is None else orbit.centre,
+        np.empty((0, 3)) if orbit is None else np.ascontiguousarray(orbit.centre),
         np.empty(0) if orbit is None else 1.0 / np.square(orbit.sigma),
         problem.points_known,
         "focal" in problem.refine,
@@ -134,9 +127,9 @@ def estimate(data: Measured, state: State) -> Estimate:
     """Room for an estimate, at a state."""
     count = len(data.joint)
     return Estimate(
-        np.array(state.rotation),
-        np.array(state.translation),
-        np.array(state.points),
+        np.array(state.rotation, order="C"),
+        np.array(state.translation, order="C"),
+        np.array(state.points, order="C"),
         np.array([state.log_growth, state.k1]),
         np.empty((3, count)),
         np.empty((2, count)),
@@ -149,16 +142,13 @@ def estimate(data: Measured, state: State) -> Estimate:
 def system(data: Measured, views: int, joints: int, with_cameras: bool = False) -> System:
     """Room for the system of a problem; ``with_cameras`` where the cameras' rows are wanted, too."""
     size = (0 if data.points_known else 3 * joints) + data.with_focal + data.with_k1
-    parts = _PARTS if len(data.joint) >= _MANY and size else 1
     return System(
         np.empty(len(data.joint)),
         np.empty(len(data.joint)),
         np.empty((views, 6, 6)),
         np.zeros((views if with_cameras else 0, 6, size + 1)),
-        np.linspace(0, views, parts + 1).astype(np.int64),
-        np.empty((parts, size, size)),
-        np.empty((parts, size)),
-        np.empty((parts, size)),
+        np.empty((size, size)),
+        np.empty(size),
     )
 
 
@@ -234,35 +224,32 @@ def propose(
     return total_cost(data, trial, sigma, phase)
 
 
-def reduce_system(data: Measured, now: Estimate, work: System, damping: float, belief: float, variance: float) -> None:
-    """Normal equations and Schur complement of the cameras; ``work.weight`` is given.
-
-    ``belief`` is the weight of the shape prior, ``variance`` that of expected centres.
-    """
-    in_parts(lambda part: reduce_views(data, now, work, part, damping, variance), len(work.matrix))
-    combine(data, now, work, damping, belief)
-
-
 @compiled
-def reduce_views(data: Measured, now: Estimate, work: System, part: int, damping: float, variance: float) -> None:
-    """The part of some views, in one pass over their detections."""
-    matrix, rhs, diagonal = work.matrix[part], work.rhs[part], work.diagonal[part]
+def reduce_system(data: Measured, now: Estimate, work: System, damping: float, belief: float, variance: float) -> None:
+    """Normal equations and Schur complement of the cameras in one pass over the detections.
+
+    ``work.weight`` is given; ``belief`` is the weight of the shape prior, ``variance`` that of expected centres.
+    """
+    matrix, rhs = work.matrix, work.rhs
     size, joints = len(rhs), len(now.points)
     shared = int(data.with_focal) + int(data.with_k1)
     points = size - shared
     most = 0
-    for n in range(work.edges[part], work.edges[part + 1]):
+    for n in range(len(now.rotation)):
         most = max(most, data.first[n + 1] - data.first[n])
     a, rows, off = np.empty((6, 2 * most)), np.empty((3, 2 * most)), np.empty(2 * most)
     lens, camera, right = np.empty((2, 2 * most)), np.empty((6, 6)), np.empty(6)
     widest = 3 * most + shared
     columns = np.empty(widest, np.uint64)  # unsigned: else every access asks whether it counts from the end
     mixed, y, dots = np.empty((6, widest)), np.empty((6, widest)), np.empty((2, widest))
+    diagonal = np.empty(size)
+    with_prior = len(data.precision) > 0 and points > 0
     for i in range(size):
         for k in range(i + 1):
-            matrix[i, k] = 0.0
-        rhs[i] = diagonal[i] = 0.0
-    for n in range(work.edges[part], work.edges[part + 1]):
+            matrix[i, k] = belief * data.precision[i, k] if with_prior and i < points else 0.0
+        rhs[i] = -belief * now.pull[i] if with_prior and i < points else 0.0
+        diagonal[i] = matrix[i, i]
+    for n in range(len(now.rotation)):
         begin, count = data.first[n], data.first[n + 1] - data.first[n]
         fill_rows(data, now, work.weight, n, a, rows, off, lens)
         for p in range(6):
@@ -337,39 +324,21 @@ def reduce_views(data: Measured, now: Estimate, work: System, part: int, damping
             if m > i:
                 for k in range(m + 1):
                     lower[columns[k]] -= dots[1, k]
-
-
-@compiled
-def combine(data: Measured, now: Estimate, work: System, damping: float, belief: float) -> None:
-    """Add the parts up, and the shape prior and Marquardt's damping to them."""
-    matrix, rhs, diagonal = work.matrix[0], work.rhs[0], work.diagonal[0]
-    for part in range(1, len(work.matrix)):
-        other = work.matrix[part]
-        for i in range(len(rhs)):
-            for k in range(i + 1):
-                matrix[i, k] += other[i, k]
-            rhs[i] += work.rhs[part, i]
-            diagonal[i] += work.diagonal[part, i]
-    for i in range(0 if data.points_known else len(data.mean)):
-        for k in range(i + 1):
-            matrix[i, k] += belief * data.precision[i, k]
-        rhs[i] -= belief * now.pull[i]
-        diagonal[i] += belief * data.precision[i, i]
-    for i in range(len(rhs)):
+    for i in range(size):
         matrix[i, i] += damped(diagonal[i], damping) - diagonal[i]
 
 
 @compiled
 def step(data: Measured, now: Estimate, to: Estimate, work: System, variance: float) -> Any:
     """Solve for the other unknowns, then each camera; False where the system is not positive definite."""
-    if not solve(work.matrix[0], work.rhs[0]):
+    if not solve(work.matrix, work.rhs):
         return False
     most = 0
     for n in range(len(now.rotation)):
         most = max(most, data.first[n + 1] - data.first[n])
     a, rows, off = np.empty((6, 2 * most)), np.empty((3, 2 * most)), np.empty(2 * most)
     lens, right, twist, turn = np.empty((2, 2 * most)), np.empty(6), np.empty(6), np.empty((3, 3))
-    change, joints = work.rhs[0], len(now.points)
+    change, joints = work.rhs, len(now.points)
     points = 0 if data.points_known else 3 * joints
     shared = int(data.with_focal) + int(data.with_k1)
     for j in range(joints):

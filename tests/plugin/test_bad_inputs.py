@@ -60,9 +60,7 @@ def rendered(tmp_path_factory) -> Callable[..., Path]:
 @pytest.fixture(scope="module")
 def plain_psnr(rendered, tmp_path_factory) -> Callable[[str], float]:
     """Test views of a pinhole camera with square pixels, trained once a method."""
-    return functools.cache(
-        lambda method: train_longer(method, rendered(), tmp_path_factory.mktemp("plain"))["psnr"]
-    )
+    return functools.cache(lambda method: train_longer(method, rendered(), tmp_path_factory.mktemp("plain"))["psnr"])
 
 
 @pytest.fixture

@@ -437,6 +437,13 @@ def test_missing_images_are_named(refused, changed):
     refused("images/frame_00002.png", "does not exist", data=changed)
 
 
+def test_a_frame_that_was_not_solved_is_named(refused, changed, solution, edit):
+    write_solution(changed, load_scene(changed), solution, changed, "inputs")
+    shutil.copy(changed / "images/frame_00001.png", changed / "images/later.png")
+    edit(changed / "transforms.json", lambda c: c["frames"].append({**c["frames"][0], "file_path": "images/later.png"}))
+    refused("images/later.png", "not among the views", data=changed, config=None)
+
+
 def test_a_cache_that_cannot_be_written_is_named(refused, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("KRONC_NS_CACHE", str(tmp_path / "file"))

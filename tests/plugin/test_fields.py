@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from kronc_ns.benchmark.fields import FieldOptions, make_field_table
+from kronc_ns.benchmark.tables.fields import FieldOptions, make_field_table
 from kronc_ns.errors import KroncError
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 
 
 def test_a_field_on_true_poses_beats_one_on_the_circle(tmp_path, monkeypatch):
-    monkeypatch.setattr("kronc_ns.benchmark.fields.Commands", InProcess)
+    monkeypatch.setattr("kronc_ns.benchmark.tables.fields.Commands", InProcess)
     capture = make_capture("walk", 32, 0, camera=default_camera("walk", 96))
     write_capture(tmp_path / "lap", capture, render=True)
     options = FieldOptions(

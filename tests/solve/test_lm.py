@@ -3,66 +3,108 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
 from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.scene import Scene
-from kronc_ns.solve.bundle import residuals
-from kronc_ns.solve.lm import LmConfig, LmResult, adjust
-from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State, focal_of
+from kronc_ns.solve import robust
+from kronc_ns.solve.lm import LmConfig, adjust
+from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State
 from tests.likelihood import maximum_likelihood
-from tests.solve.problems import FOCAL, SIMILARITY, moved, randn, scene, started
+from tests.solve import book
+from tests.solve.problems import (
+    FOCAL,
+    HALF_TURN,
+    SIMILARITY,
+    errors,
+    evaluated,
+    lengths,
+    moved,
+    projections,
+    randn,
+    scene,
+    started,
+)
 
 
-def errors(result: LmResult, truth: State, i: int = 0) -> tuple[Tensor, Tensor]:
-    return pose_errors(result.state.c2w[i], truth.c2w[i])
+def as_seen(problem: Problem) -> Problem:
+    """All detections count alike."""
+    return replace(problem, weight=(problem.weight > 0).astype(float))
 
 
 @pytest.mark.parametrize("loss", ["cauchy", "huber", "none"])
 def test_exact_keypoints_give_exact_poses(loss):
     problem, truth = scene(views=10, joints=15)
     result = adjust(problem, started(truth, 7.0, 0.5), LmConfig(loss=loss, tolerance=1e-9))
-    assert result.converged.all()
-    rotation, translation = errors(result, truth)
+    assert result.converged
+    rotation, translation = errors(result.state, truth)
     assert rotation.max() < 1e-4
     assert translation.max() < 1e-5
-    assert residuals(problem, result.state).norm.max() < 1e-3
-    assert (result.inlier == (problem.weight > 0)).all()
+    assert lengths(problem, result.state).max() < 1e-3
+    np.testing.assert_array_equal(result.inlier, problem.weight > 0)
 
 
-def as_scene(problem: Problem) -> Scene:
-    """The first scene of a batch, of a camera with its principal point in the middle of 400 x 400 pixels."""
-    views, _, joints = problem.uv.shape[1:]
+def as_scene(problem: Problem, focal: tuple[float, float] = FOCAL) -> Scene:
+    """Of a camera with its principal point in the middle of 400 x 400 pixels."""
+    views, joints = problem.weight.shape
     schema = KeypointSchema("dots", tuple(f"dot {j}" for j in range(joints)), tuple(range(joints)))
-    keypoints = torch.cat([problem.uv[0].mT + 200, (problem.weight[0] > 0).double()[..., None]], dim=-1)
-    return Scene(tuple(map(str, range(views))), Camera(*FOCAL, 200.0, 200.0, 400, 400), schema, keypoints)
+    keypoints = np.concatenate([problem.uv + 200, (problem.weight > 0)[..., None]], axis=-1)
+    return Scene(tuple(map(str, range(views))), Camera(*focal, 200.0, 200.0, 400, 400), schema, keypoints)
 
 
 @pytest.mark.parametrize("loss", ["cauchy", "none"])
 def test_without_outliers_the_result_is_the_maximum_likelihood_one(loss):
     problem, truth = scene(views=8, joints=14, noise_px=1.0, seen=0.9)
-    problem = replace(problem, weight=(problem.weight > 0).double())
+    problem = as_seen(problem)
     result = adjust(problem, started(truth), LmConfig(loss=loss))
-    best = maximum_likelihood(as_scene(problem), truth.c2w[0], truth.points[0], robust=False)
-    limit, ours = pose_errors(best, truth.c2w[0])[0], pose_errors(result.state.c2w[0], best)[0]
+    best = maximum_likelihood(as_scene(problem), truth.c2w, truth.points, robust=False)
+    limit, ours = pose_errors(best, truth.c2w)[0], pose_errors(result.state.c2w, best)[0]
     assert limit.mean() > 0.1
     assert ours.max() < 0.02 * limit.mean()
 
 
+@pytest.mark.parametrize("refine", [(), ("focal",)])
+@pytest.mark.parametrize("loss", ["none", "cauchy"])
+def test_bundle_adjustment_by_ceres_ends_at_the_same_place(loss, refine):
+    """What ends in squares without outliers ends where Ceres does."""
+    pytest.importorskip("pycolmap")
+    from kronc_ns.benchmark.peers.ceres import bundle_adjustment
+
+    focal = (FOCAL[0], FOCAL[0]) if refine else FOCAL  # pycolmap refines one
+    problem, truth = scene(views=10, joints=20, noise_px=1.0, seen=0.9)
+    uv = problem.uv * (np.array(focal) / FOCAL)
+    problem = replace(as_seen(problem), uv=uv, focal=focal, refine=refine)
+    start = started(truth, 2.0, 0.1)
+    ours = adjust(problem, start, LmConfig(loss=loss, tolerance=1e-12))
+    theirs = bundle_adjustment(
+        as_scene(problem, focal), start.c2w, start.points, refine_focal=bool(refine), function_tolerance=1e-14
+    )
+    assert ours.converged
+    assert theirs.converged
+    assert ours.inlier.sum() == (problem.weight > 0).sum()
+    rotation, translation = pose_errors(ours.state.c2w, theirs.c2w)
+    assert rotation.max() < 1e-4
+    assert translation.max() < 1e-5
+    assert pose_errors(theirs.c2w, truth.c2w)[0].mean() > 0.05  # noise moved both
+    assert focal[0] * math.exp(ours.state.log_growth) == pytest.approx(theirs.focal_px, rel=1e-6)
+
+
 def test_three_in_ten_outliers_barely_move_it():
-    problem, truth = scene(views=20, joints=40, batch=3, noise_px=1.0, outliers=0.3, seen=0.8)
-    wild = (residuals(problem, truth).norm > 15) & (problem.weight > 0)
-    assert 0.25 < float(wild.sum() / (problem.weight > 0).sum()) < 0.35
-    clean = replace(problem, weight=torch.where(wild, 0.0, problem.weight))
-    start = started(truth, 4.0, 0.3)
-    robust, oracle, blind = adjust(problem, start), adjust(clean, start), adjust(problem, start, LmConfig(loss="none"))
-    assert (robust.inlier & wild).sum() < 0.01 * wild.sum()
-    for i in range(3):
-        ours, best, naive = (errors(result, truth, i)[0].mean() for result in (robust, oracle, blind))
+    for draw in range(3):
+        problem, truth = scene(views=20, joints=40, noise_px=1.0, outliers=0.3, seen=0.8, draw=draw)
+        wild = lengths(problem, truth) > 15
+        assert 0.25 < wild.sum() / (problem.weight > 0).sum() < 0.35
+        clean = replace(problem, weight=np.where(wild, 0.0, problem.weight))
+        start = started(truth, 4.0, 0.3)
+        found = adjust(problem, start)
+        ours, best, naive = (
+            errors(result.state, truth)[0].mean()
+            for result in (found, adjust(clean, start), adjust(problem, start, LmConfig(loss="none")))
+        )
+        assert (found.inlier & wild).sum() < 0.01 * wild.sum()
         assert ours < 1.1 * best
         assert naive > 5 * best
 
@@ -71,237 +113,252 @@ def test_huber_lies_between():
     problem, truth = scene(views=20, joints=40, noise_px=1.0, outliers=0.1, seen=0.8)
     start = started(truth, 4.0, 0.3)
     cauchy, huber, none = (
-        errors(adjust(problem, start, LmConfig(loss=loss)), truth)[0].mean() for loss in ("cauchy", "huber", "none")
+        errors(adjust(problem, start, LmConfig(loss=loss)).state, truth)[0].mean()
+        for loss in ("cauchy", "huber", "none")
     )
     assert cauchy < huber < 0.5 * none
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
 def test_the_noise_is_told_from_the_residuals_whatever_the_outliers(outliers):
-    problem, truth = scene(views=20, joints=40, batch=8, noise_px=1.5, outliers=outliers, seen=0.9)
-    problem = replace(problem, weight=(problem.weight > 0).double())
-    result = adjust(problem, started(truth, 1.0, 0.05))
-    assert float(result.sigma_px.mean()) == pytest.approx(1.5, rel=0.06)
+    sigmas = []
+    for draw in range(8):
+        problem, truth = scene(views=20, joints=40, noise_px=1.5, outliers=outliers, seen=0.9, draw=draw)
+        sigmas.append(adjust(as_seen(problem), started(truth, 1.0, 0.05)).sigma_px)
+    assert np.mean(sigmas) == pytest.approx(1.5, rel=0.06)
 
 
 def test_weights_count_as_inverse_variances():
     """Half of the detections have ten times the noise: saying so in their weights helps."""
-    problem, truth = scene(views=10, joints=20, batch=20, noise_px=1.0, seen=0.9)
-    coarse = torch.rand(problem.weight.shape, generator=torch.Generator().manual_seed(0)) < 0.5
-    exact = residuals(problem, truth).error  # projection minus detection
-    problem = replace(
-        problem,
-        uv=problem.uv - torch.where(coarse, 9.0, 0.0)[:, :, None] * exact,  # ten times the noise
-        weight=torch.where(problem.weight > 0, torch.where(coarse, 0.01, 1.0), 0.0).double(),
-    )
-    start = started(truth, 1.0, 0.05)
-    weighted, flat = adjust(problem, start), adjust(replace(problem, weight=(problem.weight > 0).double()), start)
-    assert float(weighted.sigma_px.mean()) == pytest.approx(1.0, rel=0.15)
-    better = [errors(weighted, truth, i)[0].mean() < errors(flat, truth, i)[0].mean() for i in range(20)]
+    sigmas, better = [], []
+    for draw in range(20):
+        problem, truth = scene(views=10, joints=20, noise_px=1.0, seen=0.9, draw=draw)
+        coarse = np.random.default_rng(draw).random(problem.weight.shape) < 0.5
+        noise = problem.uv - projections(truth)
+        flat = replace(as_seen(problem), uv=problem.uv + 9 * coarse[..., None] * noise)
+        weighted = replace(flat, weight=flat.weight * np.where(coarse, 0.01, 1.0))
+        start = started(truth, 1.0, 0.05)
+        told, untold = adjust(weighted, start), adjust(flat, start)
+        sigmas.append(told.sigma_px)
+        better.append(errors(told.state, truth)[0].mean() < errors(untold.state, truth)[0].mean())
+    assert np.mean(sigmas) == pytest.approx(1.0, rel=0.15)
     assert sum(better) >= 18
 
 
 @pytest.mark.parametrize("loss", ["huber", "none"])
 def test_the_cost_never_increases(loss):
     problem, truth = scene(views=10, joints=20, noise_px=1.0, outliers=0.2)
-    history = adjust(problem, started(truth, 10.0, 0.8), LmConfig(loss=loss)).history()
-    assert history["step"] == list(range(1, len(history["step"]) + 1))
-    assert len(history["loss"]) > 3
-    assert all(later <= earlier for earlier, later in zip(history["loss"], history["loss"][1:], strict=False))
+    result = adjust(problem, started(truth, 10.0, 0.8), LmConfig(loss=loss))
+    assert len(result.loss) > 3
+    assert (np.diff(result.loss) <= 0).all()
 
 
-def test_a_scene_does_not_depend_on_the_others_in_its_batch():
-    """An easy scene leaves the batch early, a hard one late, and each ends where it ends alone."""
-    problem, truth = scene(views=9, joints=16, batch=3, noise_px=1.0, outliers=0.1)
-    near, far = started(truth, 0.1, 0.01), started(truth, 12.0, 0.8)
-    start = near.each(lambda a, b: torch.cat([a[:1], b[1:2], a[2:]]), far)
-    together = adjust(problem, start)
-    assert len(set(together.iterations.tolist())) > 1
-    for i in range(3):
-        chosen = torch.tensor([i])
-        alone = adjust(problem[chosen], start[chosen])
-        assert alone.iterations[0] == together.iterations[i]
-        torch.testing.assert_close(alone.state.c2w[0], together.state.c2w[i], rtol=0, atol=1e-8)
-        torch.testing.assert_close(alone.state.points[0], together.state.points[i], rtol=0, atol=1e-8)
-        torch.testing.assert_close(alone.cost[0], together.cost[i], rtol=1e-6, atol=0)
-        torch.testing.assert_close(alone.sigma_px[0], together.sigma_px[i], rtol=1e-8, atol=0)
-        assert alone.inlier[0].equal(together.inlier[i])
-        assert alone.history() == together.history(i)
-
-
-def test_same_input_same_bits():
-    problem, truth = scene(views=6, joints=12, batch=2, noise_px=1.0, outliers=0.1)
+@pytest.mark.parametrize("size", [(6, 12), (30, 45)])
+def test_same_input_same_bits(size):
+    """Also where parts are reduced on two cores."""
+    problem, truth = scene(*size, noise_px=1.0, outliers=0.1)
     first, second = (adjust(problem, started(truth)) for _ in range(2))
-    for part in ("rotation", "translation", "points"):
-        assert torch.equal(getattr(first.state, part), getattr(second.state, part))
-    assert torch.equal(first.cost, second.cost)
-    assert first.history() == second.history()
+    for name, value in vars(first.state).items():
+        np.testing.assert_array_equal(value, getattr(second.state, name))
+    assert first.cost == second.cost
+    assert first.loss == second.loss
 
 
 def test_everything_is_double_precision():
     problem, truth = scene(noise_px=1.0)
-    result = adjust(problem, started(truth))
-    parts = (*vars(result.state).values(), result.cost, result.sigma_px, result.shape_weight)
-    assert {part.dtype for part in parts} == {torch.float64}
+    state = adjust(problem, started(truth)).state
+    assert {part.dtype for part in (state.rotation, state.translation, state.points)} == {np.dtype(np.float64)}
 
 
 def test_the_start_is_left_as_it_was():
     problem, truth = scene(noise_px=1.0)
-    start = started(truth)
-    before = start.each(lambda x: x.clone())
+    start, again = started(truth), started(truth)
     adjust(problem, start)
-    assert all(a.equal(b) for a, b in zip(vars(start).values(), vars(before).values(), strict=True))
+    for name, value in vars(again).items():
+        np.testing.assert_array_equal(getattr(start, name), value)
 
 
 def test_the_world_it_starts_in_does_not_matter():
     problem, truth = scene(views=8, joints=16, noise_px=1.0, outliers=0.1)
     start = started(truth)
     here, there = adjust(problem, start), adjust(problem, moved(start, SIMILARITY))
-    rotation, translation = pose_errors(there.state.c2w[0], here.state.c2w[0])
+    rotation, translation = errors(there.state, here.state)
     assert rotation.max() < 1e-3
     assert translation.max() < 1e-4
-    torch.testing.assert_close(here.cost, there.cost, rtol=1e-2, atol=0)
+    assert there.cost == pytest.approx(here.cost, rel=1e-2)
+
+
+def turned_away(state: State, view: int) -> State:
+    """With a camera that looks the other way."""
+    rotation, translation = state.rotation.copy(), state.translation.copy()
+    rotation[view] *= HALF_TURN[:, None]
+    translation[view] *= HALF_TURN
+    return replace(state, rotation=rotation, translation=translation)
+
+
+def only(state: State, views: np.ndarray) -> State:
+    """Without the other cameras."""
+    return replace(state, rotation=state.rotation[views], translation=state.translation[views])
 
 
 def test_a_camera_that_looks_away_does_not_harm_the_others():
     problem, truth = scene(views=8, joints=16, noise_px=0.5)
-    start = started(truth)
-    start.rotation[:, 2, [0, 2]] *= -1
-    start.translation[:, 2, [0, 2]] *= -1
-    result = adjust(problem, start)
-    kept = torch.arange(8) != 2
-    rotation, _ = pose_errors(result.state.c2w[0][kept], truth.c2w[0][kept])
-    assert rotation.mean() < 0.3
-    assert result.state.c2w.isfinite().all()
-    assert not result.inlier[0, 2].any()
+    result = adjust(problem, turned_away(started(truth), 2))
+    kept = np.arange(8) != 2
+    without = replace(problem, uv=problem.uv[kept], weight=problem.weight[kept])
+    best = adjust(without, only(started(truth), kept)).state
+    assert errors(only(result.state, kept), best)[0].max() < 0.01
+    assert np.isfinite(result.state.c2w).all()
+    assert not result.inlier[2].any()
 
 
 def test_points_that_start_behind_cameras_do_not_harm_the_poses():
     problem, truth = scene(views=8, joints=16, noise_px=0.5, seen=1.0)
     start = started(truth)
-    start.points[0, :3] *= 12  # metres beyond the cameras, behind some
-    assert (residuals(problem, start).norm > 5000).any()
+    start.points[:3] *= 12  # metres beyond the cameras, behind some
+    assert (lengths(problem, start) > 5000).any()
     result = adjust(problem, start)
-    assert errors(result, truth)[0].mean() < 0.3
-    assert result.inlier[:, :, 3:].all()
+    assert errors(result.state, truth)[0].mean() < 0.3
+    assert result.inlier[:, 3:].all()
 
 
 def test_too_few_iterations_are_no_convergence():
     problem, truth = scene(views=8, joints=16, noise_px=1.0)
     result = adjust(problem, started(truth), LmConfig(iterations=2))
-    assert not result.converged.any()
-    assert result.iterations.tolist() == [2]
-    assert result.state.c2w.isfinite().all()
+    assert not result.converged
+    assert len(result.loss) == 2
+    assert np.isfinite(result.state.c2w).all()
 
 
-def test_progress_is_told_every_step():
+def test_no_iterations_leave_the_start():
+    problem, truth = scene(views=8, joints=16, noise_px=1.0)
+    start = started(truth)
+    result = adjust(problem, start, LmConfig(iterations=0))
+    assert not result.converged
+    assert (result.loss, result.path) == ((), ())
+    np.testing.assert_array_equal(result.state.points, start.points)
+
+
+def test_progress_and_path_tell_every_step():
     problem, truth = scene(views=6, joints=12, noise_px=1.0)
     calls = []
     result = adjust(problem, started(truth), progress=lambda step, loss: calls.append((step, loss)))
-    assert [step for step, _ in calls] == list(range(1, int(result.iterations[0]) + 1))
-    assert [loss for _, loss in calls] == result.history()["loss"]
+    assert calls == list(enumerate(result.loss, start=1))
+    assert len(result.path) == len(result.loss)
+    assert result.path[-1] is result.state
+    off = [errors(state, truth)[0].mean() for state in result.path]
+    assert off[0] > 1.5 * off[-1]
 
 
 def test_empty_views_and_unseen_points_stay_where_they_were():
     problem, truth = scene(views=8, joints=16, noise_px=0.5)
-    problem.weight[:, 3] = 0
-    problem.weight[:, :, 5] = 0
+    problem.weight[3] = problem.weight[:, 5] = 0
     start = started(truth)
-    result = adjust(problem, start)
-    assert result.state.c2w[:, 3].equal(start.c2w[:, 3])
-    assert result.state.points[:, 5].equal(start.points[:, 5])
-    kept = torch.arange(8) != 3
-    assert pose_errors(result.state.c2w[0][kept], truth.c2w[0][kept])[0].mean() < 0.3
+    found = adjust(problem, start).state
+    np.testing.assert_array_equal(found.c2w[3], start.c2w[3])
+    np.testing.assert_array_equal(found.points[5], start.points[5])
+    views, points = np.arange(8) != 3, np.arange(16) != 5
+    part = replace(problem, uv=problem.uv[views][:, points], weight=problem.weight[views][:, points])
+    alone = adjust(part, replace(only(start, views), points=start.points[points])).state
+    np.testing.assert_allclose(only(found, views).c2w, alone.c2w, atol=1e-6)
 
 
 def test_nothing_to_see_ends_at_once():
     problem, truth = scene()
-    result = adjust(replace(problem, weight=torch.zeros_like(problem.weight)), started(truth))
-    assert result.state.c2w.isfinite().all()
-    assert result.iterations.max() < 20
+    result = adjust(replace(problem, weight=np.zeros_like(problem.weight)), started(truth))
+    assert np.isfinite(result.state.c2w).all()
+    assert len(result.loss) < 20
     assert not result.inlier.any()
-
-
-def test_a_batch_of_no_scenes_has_no_results():
-    problem, truth = scene()
-    nobody = torch.zeros(0, dtype=torch.long)
-    result = adjust(problem[nobody], started(truth)[nobody])
-    assert result.state.c2w.shape == (0, 8, 3, 4)
-    assert len(result.converged) == 0
 
 
 @pytest.mark.parametrize("factor", [0.75, 1.25])
 def test_a_wrong_focal_length_is_found(factor):
     problem, truth = scene(views=12, joints=20, refine=("focal",))
-    wrong = replace(problem, focal=factor * problem.focal)
-    result = adjust(wrong, started(truth, unknown=1), LmConfig(tolerance=1e-9))
-    torch.testing.assert_close(focal_of(wrong, result.state), problem.focal, rtol=1e-4, atol=0)
-    assert errors(result, truth)[0].max() < 0.01
+    wrong = replace(problem, focal=(factor * FOCAL[0], factor * FOCAL[1]))
+    result = adjust(wrong, started(truth), LmConfig(tolerance=1e-9))
+    assert factor * math.exp(result.state.log_growth) == pytest.approx(1.0, rel=1e-4)
+    assert errors(result.state, truth)[0].max() < 0.01
+
+
+@pytest.mark.parametrize("refine", [("k1",), ("focal", "k1")])
+def test_the_lens_is_found(refine):
+    straight, truth = scene(views=12, joints=20, refine=refine)
+    bent = book.reprojection(straight, replace(truth, log_growth=0.1 * ("focal" in refine), k1=-0.05)).numpy()
+    result = adjust(replace(straight, uv=straight.uv + bent), started(truth), LmConfig(tolerance=1e-9))
+    assert result.state.k1 == pytest.approx(-0.05, abs=1e-4)
+    assert result.state.log_growth == pytest.approx(0.1 * ("focal" in refine), abs=1e-4)
+    assert errors(result.state, truth)[0].max() < 0.01
+
+
+def test_what_is_not_refined_stays():
+    problem, truth = scene(noise_px=1.0)
+    found = adjust(problem, replace(started(truth), log_growth=0.01, k1=0.002)).state
+    assert (found.log_growth, found.k1) == (0.01, 0.002)
+    known = adjust(replace(problem, points_known=True), replace(started(truth), points=truth.points)).state
+    np.testing.assert_array_equal(known.points, truth.points)
+
+
+def test_known_points_are_an_anchor():
+    problem, truth = scene(noise_px=0.5, points_known=True)
+    found = adjust(problem, replace(started(truth), points=truth.points)).state
+    assert np.abs(found.c2w - truth.c2w).max() < 0.05
 
 
 def test_a_shape_prior_holds_the_world_and_what_is_seen_once():
     problem, truth = scene(views=8, joints=16, noise_px=1.0, seen=1.0)
-    problem.weight[:, 1:, 4] = 0  # one view only: its depth is open without a prior
-    mean = truth.points[0] + 0.02 * randn(16, 3, seed=3)
-    prior = ShapePrior.of(mean, torch.eye(48, dtype=torch.float64) / 0.02**2)
+    problem.weight[1:, 4] = 0  # one view only: its depth is open without a prior
+    mean = truth.points + 0.02 * randn(16, 3, seed=4)
+    prior = ShapePrior.of(mean, np.eye(48) / 0.02**2)
     result = adjust(replace(problem, shape=prior), moved(started(truth), SIMILARITY))
-    assert (result.state.points - truth.points).norm(dim=-1).max() < 0.08
-    assert (result.state.c2w - truth.c2w)[..., 3].norm(dim=-1).max() < 0.15
-    assert float(result.shape_weight) > 0.9
+    assert np.linalg.norm(result.state.points - truth.points, axis=-1).max() < 0.08
+    assert np.linalg.norm((result.state.c2w - truth.c2w)[..., 3], axis=-1).max() < 0.15
+    assert result.shape_weight > 0.9
 
 
 def test_data_overrule_the_prior_of_another_shape():
     problem, truth = scene(views=12, joints=16, noise_px=0.5, seen=1.0)
-    prior = ShapePrior.of(truth.points[0] * 1.5 + 0.1, torch.eye(48, dtype=torch.float64) / 0.05**2)
-    stretched = ShapePrior.of(
-        truth.points[0] * torch.tensor([1.6, 1.0, 0.7], dtype=torch.float64),
-        torch.eye(48, dtype=torch.float64) / 0.05**2,
-    )
-    alike, odd = (adjust(replace(problem, shape=shape), started(truth)) for shape in (prior, stretched))
-    assert float(odd.shape_weight) < float(alike.shape_weight)
-    best = errors(adjust(problem, started(truth)), truth)[0].mean()
-    assert errors(odd, truth)[0].mean() < 2 * best
+    alike = ShapePrior.of(truth.points * 1.5 + 0.1, np.eye(48) / 0.05**2)
+    stretched = ShapePrior.of(truth.points * np.array([1.6, 1.0, 0.7]), np.eye(48) / 0.05**2)
+    usual, odd = (adjust(replace(problem, shape=shape), started(truth)) for shape in (alike, stretched))
+    assert odd.shape_weight < usual.shape_weight
+    best = errors(adjust(problem, started(truth)).state, truth)[0].mean()
+    assert errors(odd.state, truth)[0].mean() < 2 * best
 
 
 def test_an_orbit_carries_views_that_see_nothing():
     problem, truth = scene(views=8, joints=16, noise_px=0.5)
-    problem.weight[:, 3] = 0
-    expected = truth.c2w[..., 3] + 0.01 * randn(1, 8, 3, seed=4)
-    sigma = torch.full((1, 8), math.inf, dtype=torch.float64)
-    sigma[0, 3] = 0.1
+    problem.weight[3] = 0
+    expected = truth.c2w[..., 3] + 0.01 * randn(8, 3, seed=4)
+    sigma = np.where(np.arange(8) == 3, 0.1, math.inf)
     result = adjust(replace(problem, orbit=OrbitPrior(expected, sigma)), started(truth))
-    torch.testing.assert_close(result.state.c2w[0, 3, :, 3], expected[0, 3], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(result.state.c2w[3, :, 3], expected[3], atol=1e-3)
 
 
-@pytest.mark.parametrize("variant", ["plain", "shape", "points known"])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_compiled_loop_takes_the_tensors_way(variant, seed):
-    """An orbit that expects nothing keeps a problem from being compiled and changes nothing else."""
-    problem, truth = scene(10, 14, 2, noise_px=0.7, outliers=0.15, seed=10 * seed)
-    problem.weight[0, 2] = 0
-    if variant == "shape":
-        root = randn(42, 42, seed=seed)
-        problem = replace(problem, shape=ShapePrior.of(truth.points[0], root @ root.T / 14))
-    problem = replace(problem, points_known=variant == "points known")
-    start = started(truth, 8.0, 0.5, seed=seed)
-    if problem.points_known:
-        start = replace(start, points=truth.points)
-    nowhere = OrbitPrior(truth.c2w[..., 3], torch.full(problem.uv.shape[:2], torch.inf, dtype=torch.float64))
-    steps: list[tuple[int, float]] = []
-    ours = adjust(problem, start, progress=lambda *step: steps.append(step))
-    theirs = adjust(replace(problem, orbit=nowhere), start)
-    assert ours.iterations.tolist() == theirs.iterations.tolist()
-    assert ours.converged.all()
-    assert theirs.converged.all()
-    assert torch.equal(ours.inlier, theirs.inlier)
-    for name in ("cost", "sigma_px", "shape_weight"):
-        torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-7, atol=1e-9)
-    residual = [residuals(problem, result.state).norm for result in (ours, theirs)]
-    torch.testing.assert_close(*residual, rtol=1e-5, atol=1e-5)  # the gauge is free
-    assert ours.path(0)[-1].equal(ours.state.c2w[0])
-    spread = [
-        result.path(1)[..., 3].sub(result.path(1)[..., 3].mean(1, True)).norm(dim=-1) for result in (ours, theirs)
-    ]
-    torch.testing.assert_close(*spread, rtol=1e-5, atol=1e-5)
-    assert steps == list(zip(range(1, len(steps) + 1), ours.history()["loss"], strict=True))
-    torch.testing.assert_close(torch.tensor(ours.history()["loss"]), torch.tensor(theirs.history()["loss"]))
+def test_expectations_of_nothing_change_nothing():
+    problem, truth = scene(views=8, joints=16, noise_px=0.5, outliers=0.1)
+    nowhere = OrbitPrior(truth.c2w[..., 3] + 1.0, np.full(8, math.inf))
+    ours, theirs = (adjust(one, started(truth)) for one in (problem, replace(problem, orbit=nowhere)))
+    assert ours.loss == theirs.loss
+    np.testing.assert_array_equal(ours.state.points, theirs.state.points)
+
+
+def test_noise_of_a_start_nearly_right_is_not_believed_beyond_what_is_asked():
+    """Few right detections among many wrong ones: the median residual would make all of them inliers."""
+    problem, truth = scene(views=10, joints=30, noise_px=0.5, outliers=0.55, seen=1.0)
+    problem = replace(problem, points_known=True)
+    start = replace(started(truth, 0.5, 0.02), points=truth.points)
+    believing, doubting = adjust(problem, start), adjust(problem, start, most_sigma_px=1.0)
+    assert doubting.sigma_px <= 1.0
+    assert errors(doubting.state, truth)[0].mean() <= errors(believing.state, truth)[0].mean()
+    wild = lengths(problem, truth) > 15
+    assert (doubting.inlier & wild).sum() < 0.02 * wild.sum()
+
+
+def test_the_cost_is_that_of_the_state():
+    """In units of sigma^2, at what the last phase calls for."""
+    problem, truth = scene(views=8, joints=16, noise_px=1.0, outliers=0.1)
+    result = adjust(problem, started(truth))
+    length = evaluated(problem, result.state).length
+    expected = robust.cost(length, result.sigma_px, robust.TRIMMED) / result.sigma_px**2
+    assert result.cost == pytest.approx(expected)
+    assert result.loss[-1] == pytest.approx(math.sqrt(expected / len(length)) * result.sigma_px)

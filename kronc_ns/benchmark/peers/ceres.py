@@ -1,12 +1,12 @@
 """Bundle adjustment by pycolmap (Ceres): from the truth the yardstick of the tables, from a noisy start a peer."""
 
+import math
 import time
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import torch
+import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import rays
@@ -24,9 +24,9 @@ _LEAST_POINTS = 4  # a view with fewer keypoints has no pose of its own
 class Adjustment:
     """Where bundle adjustment ended."""
 
-    c2w: Float[Tensor, "n 3 4"]
+    c2w: Float[np.ndarray, "n 3 4"]
     """Poses; NaN where a view has too few keypoints to have one."""
-    points: Float[Tensor, "j 3"]
+    points: Float[np.ndarray, "j 3"]
     """Keypoints; NaN where fewer than two views see one."""
     focal_px: float
     seconds: float
@@ -36,9 +36,9 @@ class Adjustment:
 
 def bundle_adjustment(
     scene: Scene,
-    c2w: Float[Tensor, "n 3 4"],
-    points: Float[Tensor, "j 3"] | None = None,
-    used: Bool[Tensor, "n j"] | None = None,
+    c2w: Float[np.ndarray, "n 3 4"],
+    points: Float[np.ndarray, "j 3"] | None = None,
+    used: Bool[np.ndarray, "n j"] | None = None,
     loss: Loss = "trivial",
     refine_focal: bool = False,
     function_tolerance: float = 0.0,
@@ -49,18 +49,14 @@ def bundle_adjustment(
     Free gauge, one focal length, everything else as pycolmap has it by default (Levenberg-Marquardt, a gradient
     tolerance of 1e-4, at most 100 steps); Ceres' own default for ``function_tolerance`` is 1e-6.
     """
-    import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
-
-    import pycolmap
-
-    used = (scene.visibility > 0) if used is None else used & (scene.visibility > 0)
-    used = used & (used.sum(1, keepdim=True) >= _LEAST_POINTS)
-    used = used & (used.sum(0) >= 2)
-    points = triangulate(c2w, rays(scene.uv, scene.camera), used.to(c2w)) if points is None else points
-    model = _model(scene, c2w, points, used)
+    pycolmap = load_pycolmap()
+    counted = scene.seen if used is None else used & scene.seen
+    counted = counted & (counted.sum(1, keepdims=True) >= _LEAST_POINTS)
+    counted = counted & (counted.sum(0) >= 2)
+    if points is None:
+        points = triangulate(c2w, rays(scene.uv, scene.camera), counted.astype(np.float64))
+    model = _model(scene, c2w, points, counted)
     options = pycolmap.BundleAdjustmentOptions()
-    if not hasattr(options, "ceres"):
-        raise KroncError(f"pycolmap {pycolmap.__version__} is too old for the benchmark: pip install 'pycolmap>=4.1'")
     options.refine_focal_length = refine_focal
     options.refine_extra_params = False
     options.print_summary = False
@@ -74,29 +70,38 @@ def bundle_adjustment(
     config = pycolmap.BundleAdjustmentConfig()  # pycolmap.bundle_adjustment would fix two cameras as the gauge
     for view in model.images:
         config.add_image(view)
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.ERROR.value
-    try:  # a start far off makes Ceres warn of every singular step it goes on to damp
-        start = time.perf_counter()
-        summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-        seconds = time.perf_counter() - start
-    finally:
-        pycolmap.logging.minloglevel = level
+    start = time.perf_counter()
+    summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    seconds = time.perf_counter() - start
 
-    posed, known = used.any(1), used.any(0)
-    adjusted = torch.full_like(c2w, torch.nan)
-    w2c = [model.images[int(i) + 1].cam_from_world().matrix() for i in torch.nonzero(posed)]
-    adjusted[posed] = invert(torch.stack([torch.from_numpy(pose) for pose in w2c]).to(c2w))
-    world = torch.full_like(points, torch.nan)
-    xyz = [torch.from_numpy(model.points3D[int(j) + 1].xyz) for j in torch.nonzero(known)]
-    world[known] = torch.stack(xyz).to(points)
+    posed, known = counted.any(1), counted.any(0)
+    adjusted = np.full(c2w.shape, math.nan)
+    adjusted[posed] = invert(
+        np.stack([model.images[i + 1].cam_from_world().matrix() for i in np.flatnonzero(posed).tolist()])
+    )
+    world = np.full(points.shape, math.nan)
+    world[known] = np.stack([model.points3D[j + 1].xyz for j in np.flatnonzero(known).tolist()])
     converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
     return Adjustment(adjusted, world, float(model.cameras[1].params[0]), seconds, converged)
 
 
-def _model(scene: Scene, c2w: Tensor, points: Tensor, used: Tensor) -> Any:
-    """pycolmap's model: image i + 1 has all J keypoints, those that are used observe point j + 1."""
+def load_pycolmap() -> Any:
+    """The module, silent but for errors: a start far off makes Ceres warn of every singular step it damps."""
+    import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
+
     import pycolmap
 
+    if not hasattr(pycolmap.BundleAdjustmentOptions(), "ceres"):
+        raise KroncError(f"pycolmap {pycolmap.__version__} is too old for the benchmark: pip install 'pycolmap>=4.1'")
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    return pycolmap
+
+
+def _model(
+    scene: Scene, c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"], used: Bool[np.ndarray, "n j"]
+) -> Any:
+    """pycolmap's model: image i + 1 has all J keypoints, those that are used observe point j + 1."""
+    pycolmap = load_pycolmap()
     camera = scene.camera
     model = pycolmap.Reconstruction()
     kind, focal = "SIMPLE_PINHOLE", [camera.fx]  # refined as one
@@ -106,12 +111,12 @@ def _model(scene: Scene, c2w: Tensor, points: Tensor, used: Tensor) -> Any:
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(camera_id=1, model=kind, width=camera.width, height=camera.height, params=intrinsics)
     )
-    uv, w2c = scene.uv.double().numpy(), invert(c2w).double().numpy()
-    for i in torch.nonzero(used.any(1))[:, 0].tolist():
-        image = pycolmap.Image(name=scene.names[i], keypoints=uv[i], camera_id=1, image_id=i + 1)
+    w2c = invert(c2w)
+    for i in np.flatnonzero(used.any(1)).tolist():
+        image = pycolmap.Image(name=scene.names[i], keypoints=scene.uv[i], camera_id=1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(w2c[i]))
-    for j in torch.nonzero(used.any(0))[:, 0].tolist():
-        model.add_point3D_with_id(j + 1, pycolmap.Point3D(xyz=points[j].double().numpy()))
-    for i, j in torch.nonzero(used).tolist():
+    for j in np.flatnonzero(used.any(0)).tolist():
+        model.add_point3D_with_id(j + 1, pycolmap.Point3D(xyz=points[j]))
+    for i, j in np.argwhere(used).tolist():
         model.add_observation(j + 1, pycolmap.TrackElement(i + 1, j))
     return model

@@ -1,15 +1,15 @@
 """COLMAP's mappers, on image features or on semantic keypoints, with the intrinsics known."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
+from kronc_ns.benchmark.peers.ceres import load_pycolmap
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.poses import invert
 from kronc_ns.scene import Scene
@@ -19,7 +19,7 @@ Mapper = Literal["incremental", "global"]
 _LEAST_INLIERS = 8
 
 
-def map_images(scene: Scene, folder: Path, mapper: Mapper, masked: bool) -> Float[Tensor, "n 3 4"]:
+def map_images(scene: Scene, folder: Path, mapper: Mapper, masked: bool) -> Float[np.ndarray, "n 3 4"]:
     """Poses from SIFT features (CPU, COLMAP's settings) matched between all pairs; NaN where a view is not placed.
 
     ``masked`` leaves out features on the background.
@@ -42,12 +42,12 @@ def map_images(scene: Scene, folder: Path, mapper: Mapper, masked: bool) -> Floa
         return _map(scene, database, folder, mapper, Path(scratch), few=False)
 
 
-def map_keypoints(scene: Scene, mapper: Mapper) -> Float[Tensor, "n 3 4"]:
+def map_keypoints(scene: Scene, mapper: Mapper) -> Float[np.ndarray, "n 3 4"]:
     """Poses from keypoints of the same meaning as matches between all views that see eight or more of the same."""
     pycolmap = load_pycolmap()
     with TemporaryDirectory(prefix="kronc_colmap_") as scratch:
         database = Path(scratch) / "database.db"
-        seen = (scene.visibility > 0).numpy()
+        seen = scene.seen
         opened = pycolmap.Database.open(database)
         camera = pycolmap.Camera(
             model=_model(scene),
@@ -61,7 +61,7 @@ def map_keypoints(scene: Scene, mapper: Mapper) -> Float[Tensor, "n 3 4"]:
         rig.add_ref_sensor(camera.sensor_id)
         opened.write_rig(rig)
         pairs = []
-        for i, (name, uv) in enumerate(zip(scene.names, scene.keypoints[..., :2].numpy(), strict=True)):
+        for i, (name, uv) in enumerate(zip(scene.names, scene.keypoints[..., :2], strict=True)):
             image = pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=i + 1)
             opened.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=i + 1, rig_id=1)
@@ -83,7 +83,7 @@ def map_keypoints(scene: Scene, mapper: Mapper) -> Float[Tensor, "n 3 4"]:
 
 def _map(
     scene: Scene, database: Path, images: Path, mapper: Mapper, scratch: Path, few: bool
-) -> Float[Tensor, "n 3 4"]:
+) -> Float[np.ndarray, "n 3 4"]:
     """Poses of the largest model that the mapper makes of a database; intrinsics stay as they are."""
     pycolmap = load_pycolmap()
     models = scratch / "models"
@@ -106,13 +106,13 @@ def _map(
         if few:
             options.min_num_matches = _LEAST_INLIERS
         found = pycolmap.global_mapping(database, images, models, options)
-    c2w = torch.full((len(scene), 3, 4), torch.nan, dtype=torch.float64)
+    c2w = np.full((len(scene), 3, 4), math.nan)
     if found:
         model = max(found.values(), key=lambda one: one.num_reg_images())
         rows = {name: i for i, name in enumerate(scene.names)}
         for image in model.images.values():
             if image.has_pose:
-                c2w[rows[image.name]] = invert(torch.from_numpy(image.cam_from_world().matrix()))
+                c2w[rows[image.name]] = invert(image.cam_from_world().matrix())
     return c2w
 
 
@@ -137,13 +137,3 @@ def _parameters(scene: Scene) -> str:
     if any(camera.distortion):
         values = (*values, *camera.distortion)
     return ",".join(map(str, values))
-
-
-def load_pycolmap() -> Any:
-    """The module, silent but for errors."""
-    import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
-
-    import pycolmap
-
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    return pycolmap

@@ -1,6 +1,5 @@
 """Ways from a scene to its poses, side by side: ours, the paper's, bundle adjustment, and COLMAP's mappers."""
 
-import math
 import multiprocessing
 import time
 from collections.abc import Callable
@@ -11,19 +10,20 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 from typing_extensions import assert_never
 
-from kronc_ns.benchmark.baselines import bundle_adjustment
-from kronc_ns.benchmark.colmap import load_pycolmap, map_images, map_keypoints
+from kronc_ns.benchmark.figures import pose_figures
 from kronc_ns.benchmark.memory import with_peak
+from kronc_ns.benchmark.peers.adam import PAPERS, one_step
+from kronc_ns.benchmark.peers.ceres import bundle_adjustment, load_pycolmap
+from kronc_ns.benchmark.peers.colmap import map_images, map_keypoints
 from kronc_ns.benchmark.subjects import Subject
 from kronc_ns.errors import KroncError
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.fit.starts import circular_poses
-from kronc_ns.metrics.poses import AUC_LIMITS_DEG, evaluate_poses
 from kronc_ns.scene import Scene
 
 Method = Literal[
@@ -49,16 +49,20 @@ START = (4.0, 0.5)
 class Placed:
     """What a method made of a scene."""
 
-    c2w: Float[Tensor, "n 3 4"]
+    c2w: Float[np.ndarray, "n 3 4"]
     """NaN where a view has no pose."""
     seconds: float
     """From keypoints or images to poses, initialisation included, with everything loaded and compiled before."""
     megabytes: float
     """Peak memory above what the process had before, libraries loaded; NaN where the system does not tell."""
 
+    def figures(self, truth: Float[np.ndarray, "n 3 4"]) -> dict[str, float]:
+        """Errors against the truth (`pose_figures`), time and memory."""
+        return {**pose_figures(self.c2w, truth), "seconds": self.seconds, "megabytes": self.megabytes}
+
 
 def place(
-    method: Method, subject: Subject, start: Float[Tensor, "n 3 4"] | None = None, config: KroncConfig | None = None
+    method: Method, subject: Subject, start: Float[np.ndarray, "n 3 4"] | None = None, config: KroncConfig | None = None
 ) -> Placed:
     """Poses of a subject, computed in a process of its own. Methods that need poses to start from get ``start``.
 
@@ -76,54 +80,21 @@ def place(
             raise KroncError(f"{method} on {subject.name} ended its process: is there memory enough?") from None
 
 
-def figures(placed: Placed, subject: Subject) -> dict[str, float]:
-    """Errors against the truth after a similarity alignment, the share of views with a pose, time and memory.
-
-    Fewer than three views with a pose have no errors (NaN) and a recall of 0.
-    """
-    names = subject.scene.names
-    ok = placed.c2w.isfinite().all(-1).all(-1).tolist()
-    found = {
-        "registered": sum(ok) / len(ok),
-        "seconds": placed.seconds,
-        "megabytes": placed.megabytes,
-    }
-    if sum(ok) < 3:
-        missing = ("rotation_deg", "median_deg", "worst_deg", "centre_cm", "median_cm", "worst_cm")
-        return {**dict.fromkeys(missing, math.nan), **{f"auc_{x}": 0.0 for x in AUC_LIMITS_DEG}, **found}
-    errors = evaluate_poses(
-        {name: pose for name, pose, here in zip(names, placed.c2w, ok, strict=True) if here},
-        dict(zip(names, subject.truth, strict=True)),
-    ).as_dict()
-    rotation, centre = errors["rotation_deg"], errors["translation"]
-    return {
-        "rotation_deg": rotation["mean"],
-        "median_deg": rotation["median"],
-        "worst_deg": rotation["max"],
-        "centre_cm": 100 * centre["mean"],
-        "median_cm": 100 * centre["median"],
-        "worst_cm": 100 * centre["max"],
-        **{f"auc_{x}": errors[f"auc_{x}deg"] for x in AUC_LIMITS_DEG},
-        **found,
-    }
-
-
 def _warm_up(method: Method, scene: Scene, folder: Path | None, config: KroncConfig | None) -> None:
     """What a method does once in a process only: compile itself, load libraries."""
     if method in ("kronc", "ceres"):
         _poses(method, scene, folder, config)
     elif method == "adam":
-        config = config or KroncConfig()
-        _poses(method, scene, folder, replace(config, adam=replace(config.adam, steps=1)))
+        _poses(method, scene, folder, one_step(config or PAPERS))
     else:
         load_pycolmap()
 
 
-def _measured(warm_up: Callable[[], None], run: Callable[[], Tensor]) -> Placed:
+def _measured(warm_up: Callable[[], None], run: Callable[[], np.ndarray]) -> Placed:
     """In the other process: poses, time and memory."""
     warm_up()
 
-    def timed() -> tuple[Tensor, float]:
+    def timed() -> tuple[np.ndarray, float]:
         begin = time.perf_counter()
         return run(), time.perf_counter() - begin
 
@@ -131,13 +102,12 @@ def _measured(warm_up: Callable[[], None], run: Callable[[], Tensor]) -> Placed:
     return Placed(c2w, seconds, megabytes)
 
 
-def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfig | None) -> Float[Tensor, "n 3 4"]:
+def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfig | None) -> Float[np.ndarray, "n 3 4"]:
     match method:
-        case "kronc" | "adam":
-            solver: Literal["lm", "adam"] = "lm" if method == "kronc" else "adam"
-            config = config or KroncConfig()
-            solution = solve_scene(scene, replace(config, solver=solver, min_status="solved"))
-            return solution.c2w
+        case "kronc":
+            return solve_scene(scene, replace(config or KroncConfig(), solver="lm", min_status="solved")).c2w
+        case "adam":
+            return solve_scene(scene, replace(config or PAPERS, solver="adam", min_status="solved")).c2w
         case "ceres":
             circle = KroncConfig()
             start = scene.given_c2w

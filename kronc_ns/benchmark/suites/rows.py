@@ -1,84 +1,102 @@
-"""A row of a table: what is asked, how one seed is measured, what the seeds amount to."""
+"""A row of a suite: how one seed is measured, what is asked of all of them, and what they reach."""
 
 import math
-import os
-import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-import torch
+from typing_extensions import assert_never
 
+from kronc_ns.benchmark.figures import Figures, plain
 from kronc_ns.errors import KroncError
 
-Figures = Mapping[str, float]
-"""What one seed gave, by name; units are suffixes of the names."""
+Statistic = Literal["mean", "median", "worst", "total"]
+"""What becomes of a figure of all seeds."""
 
 
-OTHERS = ("best_", "adam_")
-"""Beginnings of the names of figures that are not the solver's own."""
+def named(figure: str, statistic: Statistic) -> str:
+    """What a statistic of a figure is called."""
+    return figure if statistic in ("mean", "total") else f"{figure}_{statistic}"
 
 
-class Runs:
-    """The figures of all seeds of a row; a seed that could not be solved counts as infinitely bad."""
-
-    def __init__(self, figures: Sequence[Figures]) -> None:
-        self.figures = figures
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        """[seeds] one figure of every seed that has it; the solver's own are infinite where it failed."""
-        own = not name.startswith(OTHERS)
-        values = [one.get(name, math.inf) for one in self.figures if name in one or (own and "failed" in one)]
-        return np.array(values, dtype=float)
-
-    def median(self, name: str) -> float:
-        """Median over the seeds."""
-        return float(np.median(self[name])) if len(self[name]) else math.nan
-
-    def mean(self, name: str) -> float:
-        """Mean over the seeds."""
-        return float(np.mean(self[name])) if len(self[name]) else math.nan
-
-    def worst(self, name: str) -> float:
-        """Largest value over the seeds."""
-        return float(np.max(self[name])) if len(self[name]) else math.nan
-
-    def total(self, name: str) -> float:
-        """Sum over the seeds that were solved."""
-        return float(sum(one.get(name, 0.0) for one in self.figures))
-
-    @property
-    def lost(self) -> int:
-        """Seeds that could not be solved, or in which views are left without a pose."""
-        return sum("failed" in one or one.get("registered", 1.0) < 1 for one in self.figures)
-
-
-Judge = Callable[[Runs], tuple[Figures, bool | None]]
-"""Figures to print, and whether they are what was asked (None: nothing was asked)."""
+def summary(values: Sequence[float], statistic: Statistic, large_is_bad: bool = True) -> float:
+    """A statistic of the seeds' figures; NaN of none."""
+    if not values:
+        return math.nan
+    match statistic:
+        case "mean":
+            return float(np.mean(values))
+        case "median":
+            return float(np.median(values))
+        case "worst":
+            return float(max(values) if large_is_bad else min(values))
+        case "total":
+            return float(sum(values))
+        case _:
+            assert_never(statistic)
 
 
 @dataclass(frozen=True)
-class Task:
+class Limit:
+    """What is asked of a figure."""
+
+    figure: str
+    statistic: Statistic = "mean"
+    at_most: float = math.inf
+    at_least: float = -math.inf
+
+    def __str__(self) -> str:
+        least = f"{self.at_least:g} <= " if self.at_least > -math.inf else ""
+        if self.at_most == math.inf:
+            return f"{self.name} >= {self.at_least:g}"
+        return f"{least}{self.name} <= {self.at_most:g}"
+
+    @property
+    def name(self) -> str:
+        """Of what is reached."""
+        return named(self.figure, self.statistic)
+
+    def reached(self, seeds: Sequence[Figures]) -> float:
+        """The statistic over the seeds that have the figure; one that could not be solved is infinitely bad."""
+        large_is_bad = self.at_most < math.inf
+        bad = math.inf if large_is_bad else -math.inf
+        values = [one.get(self.figure, bad) for one in seeds if self.figure in one or "failed" in one]
+        return summary(values, self.statistic, large_is_bad)
+
+    def holds(self, reached: float) -> bool:
+        """Whether this is what was asked; NaN never is."""
+        return self.at_least <= reached <= self.at_most
+
+
+NONE_LOST = Limit("seeds_lost", "total", at_most=0)
+"""Every seed is solved, and every view of it has a pose."""
+
+
+@dataclass(frozen=True)
+class Row:
     """A row before it is measured."""
 
     name: str
-    asked: str
-    """The number to reach, in words."""
     note: str
     """The capture, its noise and the start: what the figures cannot be read without."""
     seeds: int
     """How many seeds the row asks for."""
     measure: Callable[[int], Figures]
-    """Figures of one seed."""
-    judge: Judge
+    """Figures of one seed; `KroncError` where it cannot be solved."""
+    limits: tuple[Limit, ...] = ()
+    """What is asked; of a row without limits nothing is."""
+    beside: Mapping[Statistic, tuple[str, ...]] = field(default_factory=dict)
+    """Other figures to show, of the seeds that have them."""
+    printed: Mapping[str, float] = field(default_factory=dict)
+    """What somebody else has printed, to stand beside."""
 
 
 @dataclass(frozen=True)
-class Row:
+class Measured:
     """A row as measured."""
 
     name: str
@@ -99,76 +117,62 @@ class Row:
         return plain(asdict(self))
 
 
-def measure_row(task: Task, seeds: Sequence[int], progress: Callable[[int, int], None] | None = None) -> Row:
+def measure_row(row: Row, seeds: Sequence[int], progress: Callable[[int, int], None] | None = None) -> Measured:
     """Measure all seeds of a row; a seed that raises `KroncError` is recorded as failed and counts against the row."""
     start = time.perf_counter()
     figures: list[Figures] = []
     failures: dict[int, str] = {}
     for i, seed in enumerate(seeds):
         try:
-            figures.append(dict(task.measure(seed)))
+            found = row.measure(seed)
+            figures.append({**found, "seeds_lost": float(found.get("registered", 1.0) < 1)})
         except KroncError as error:
-            figures.append({"failed": 1.0})
+            figures.append({"failed": 1.0, "seeds_lost": 1.0})
             failures[seed] = str(error)
         if progress is not None:
             progress(i + 1, len(seeds))
-    reached, passed = task.judge(Runs(figures))
-    seconds = time.perf_counter() - start
-    return Row(task.name, task.asked, reached, passed, tuple(seeds), seconds, task.note, failures, tuple(figures))
+    reached = {limit.name: limit.reached(figures) for limit in row.limits}
+    passed = all(limit.holds(reached[limit.name]) for limit in row.limits) if row.limits else None
+    for statistic, names in row.beside.items():
+        for name in names:
+            if values := [one[name] for one in figures if name in one]:
+                reached.setdefault(named(name, statistic), summary(values, statistic))
+    reached |= {**row.printed, NONE_LOST.name: NONE_LOST.reached(figures)}
+    return Measured(
+        name=row.name,
+        asked=", ".join(map(str, row.limits)),
+        reached=reached,
+        passed=passed,
+        seeds=tuple(seeds),
+        seconds=time.perf_counter() - start,
+        note=row.note,
+        failures=failures,
+        per_seed=tuple(figures),
+    )
 
 
 def measure_rows(
-    tasks: Sequence[Task],
+    rows: Sequence[Row],
     first_seed: int = 0,
     seeds: int | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     workers: int = 1,
-) -> Iterator[Row]:
+) -> Iterator[Measured]:
     """Measure rows on report seeds ``first_seed``, ...; ``seeds`` overrides their number.
 
     They come in their order, one after the other; with several ``workers`` as many are measured at the same time.
     """
 
-    def measure(task: Task) -> Row:
-        count = task.seeds if seeds is None else seeds
-        report = None if progress is None else partial(progress, task.name)
-        return measure_row(task, range(first_seed, first_seed + count), report)
+    def measure(row: Row) -> Measured:
+        count = row.seeds if seeds is None else seeds
+        report = None if progress is None else partial(progress, row.name)
+        return measure_row(row, range(first_seed, first_seed + count), report)
 
     if workers == 1:  # in the thread that is the program's: others have other numbers of threads to compute with
-        yield from map(measure, tasks)
+        yield from map(measure, rows)
         return
     pool = ThreadPoolExecutor(workers)
     try:
-        yield from pool.map(measure, tasks)
+        yield from pool.map(measure, rows)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-
-
-def hardware() -> dict[str, Any]:
-    """The machine the figures were taken on, and how busy it was."""
-    cpu = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            cpu = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), cpu)
-    except OSError:
-        pass
-    return {
-        "cpu": cpu,
-        "cores": os.cpu_count(),
-        "torch_threads": torch.get_num_threads(),
-        "load_1min": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
-
-
-def plain(value: Any) -> Any:
-    """Lists, dicts and numbers for JSON; what is not finite becomes None."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -9,10 +9,9 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import torch
-
 from kronc_ns.benchmark.commands import Commands
-from kronc_ns.benchmark.rows import Figures, Runs
+from kronc_ns.benchmark.figures import Figures
+from kronc_ns.benchmark.suites.captures import noisy_start
 from kronc_ns.benchmark.training import Poses, train, write_variant
 from kronc_ns.files.keypoints import write_keypoints
 from kronc_ns.files.transforms import read_poses
@@ -21,10 +20,7 @@ from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.metrics.poses import evaluate_poses
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, default_camera, make_capture
-from kronc_ns.synthetic.variations import noisy_poses
 
-START = (4.0, 0.5)
-"""Noise of the poses before they are solved: degrees, metres."""
 EVAL_INTERVAL = 5
 """Every so manieth view is a test view."""
 
@@ -117,7 +113,7 @@ class Trainings:
         keypoints = data / f"{kind.folder}.json"
         names = list(read_poses(data / "reference.json"))
         size = (detected.camera.width, detected.camera.height)
-        write_keypoints(keypoints, APOLLOCAR3D_66, size, dict(zip(names, detected.keypoints.numpy(), strict=True)))
+        write_keypoints(keypoints, APOLLOCAR3D_66, size, dict(zip(names, detected.keypoints, strict=True)))
         with self._solving:
             write_variant(folder, data, kind.poses, KroncConfig(init="given"), detected.points, keypoints)
         return folder
@@ -125,37 +121,11 @@ class Trainings:
     def _capture(self, seed: int) -> Path:
         """The rendered scene folder, with noisy poses to start from."""
         capture, folder = self._make(seed), self._folder / f"seed_{seed}" / "capture"
-        start = noisy_poses(capture.c2w, *START, torch.Generator().manual_seed(seed))
-        write_capture(folder, capture, start, render=True, ground=False)
+        write_capture(folder, capture, noisy_start(capture, seed), render=True, ground=False)
         return folder
 
     def _make(self, seed: int, noise_px: float = 0.0) -> Capture:
         return make_capture("carpatch", self._views, seed, noise_px, camera=default_camera("carpatch", self._width))
-
-
-def judge_exact(runs: Runs, least_db: float) -> tuple[Figures, bool]:
-    """Whether exact poses give ``least_db`` on the mean."""
-    figures = _means(runs)
-    return figures, runs.lost == 0 and figures["psnr"] >= least_db
-
-
-def judge_solved(runs: Runs, limit_db: float) -> tuple[Figures, bool]:
-    """Whether solved poses cost ``limit_db`` at the most."""
-    figures = _means(runs)
-    return figures, runs.lost == 0 and figures["psnr_below_exact"] <= limit_db
-
-
-def judge_nothing(runs: Runs) -> tuple[Figures, None]:
-    """Shown beside the others."""
-    return _means(runs), None
-
-
-def _means(runs: Runs) -> dict[str, float]:
-    """Means over the seeds that could be trained and tested."""
-    done = [one for one in runs.figures if "failed" not in one]
-    return {name: sum(one[name] for one in done) / len(done) for name in (done[0] if done else {})} | {
-        "lost": runs.lost
-    }
 
 
 def _metrics(metrics: Mapping[str, float | None], prefix: str) -> dict[str, float]:

@@ -9,20 +9,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from jaxtyping import Float
 from rich.console import Console
-from torch import Tensor
 
 from kronc_ns.benchmark.commands import Commands
-from kronc_ns.benchmark.peers import Method, Placed, figures, place
-from kronc_ns.benchmark.rows import hardware, plain
-from kronc_ns.benchmark.settings import ADAM_FROM_CIRCLE
+from kronc_ns.benchmark.figures import plain, pose_figures
+from kronc_ns.benchmark.machine import hardware, in_words
+from kronc_ns.benchmark.peers import adam
+from kronc_ns.benchmark.peers.methods import Method, place
 from kronc_ns.benchmark.subjects import Subject, from_folder
+from kronc_ns.benchmark.tables.rendering import Table
 from kronc_ns.benchmark.training import train, write_poses
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import atomic_path, write_json
 from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import umeyama
+from kronc_ns.geometry.poses import posed
 
 PosesOf = Method | Literal["reference", "circle"]
 _PAPER = {
@@ -72,16 +75,17 @@ def make_field_table(options: FieldOptions) -> None:
 
 def _write(rows: Sequence[Mapping[str, Any]], options: FieldOptions, machine: Mapping[str, Any], seconds: float) -> str:
     """Write what there is of the table; its Markdown."""
-    head = ["capture", "poses", "views placed", "rotation, centre (median)", *options.backgrounds, "paper"]
-    lines = [head, ["---"] * len(head), *([*row["cells"], _PAPER.get(row["poses"], "-")] for row in rows)]
-    text = (
-        "## Fields on the poses of several methods\n\n"
-        + "\n".join(f"| {' | '.join(line)} |" for line in lines)
-        + "\n\nPSNR (dB) / SSIM of the full frame (of the vehicle) over the test views; keep: trained on the full "
-        f"frame, white: on the vehicle cut out; a dash: fewer than three views placed. `{options.method}`, images 1/"
-        f"{options.downscale_factor} in size, every 8th view for testing, {machine['cores']} cores "
-        f"({machine['cpu']}), load {machine['load_1min'] or 0:.1f}; {seconds:.0f} s in all.\n"
+    about = (
+        "PSNR (dB) / SSIM of the full frame (of the vehicle) over the test views; keep: trained on the full frame, "
+        f"white: on the vehicle cut out; a dash: fewer than three views placed. `{options.method}`, images 1/"
+        f"{options.downscale_factor} in size, every 8th view for testing, {in_words(machine)}; {seconds:.0f} s in all."
     )
+    text = Table(
+        "Fields on the poses of several methods",
+        ["capture", "poses", "views placed", "rotation, centre (median)", *options.backgrounds, "paper"],
+        [[*row["cells"], _PAPER.get(row["poses"], "-")] for row in rows],
+        about,
+    ).markdown()
     with atomic_path(options.output_dir / "fields.md") as path:
         path.write_text(text, encoding="utf-8")
     write_json(options.output_dir / "fields.json", plain({"hardware": machine, "seconds": seconds, "rows": rows}))
@@ -110,19 +114,19 @@ def _row(subject: Subject, poses: PosesOf, options: FieldOptions, commands: Comm
     return {**row, "results": results, "cells": cells}
 
 
-def _poses(subject: Subject, poses: PosesOf) -> tuple[Float[Tensor, "n 3 4"], dict[str, float]]:
+def _poses(subject: Subject, poses: PosesOf) -> tuple[Float[np.ndarray, "n 3 4"], dict[str, float]]:
     """Poses in the frame of the reference, and their errors (NaN below three views, which nothing aligns)."""
     if poses == "reference":
         c2w = subject.truth
     elif poses == "circle":
-        circle = ADAM_FROM_CIRCLE
+        circle = adam.FROM_CIRCLE
         c2w = circular_poses(len(subject.truth), circle.radius_m, circle.direction, circle.laps)
     else:
-        c2w = place(poses, subject, None, ADAM_FROM_CIRCLE if poses == "adam" else None).c2w
-    posed = c2w.isfinite().all(-1).all(-1)
-    if int(posed.sum()) >= 3:
-        c2w = umeyama(c2w[posed][..., 3], subject.truth[posed][..., 3]).apply_to_poses(c2w)
-    return c2w, figures(Placed(c2w, 0.0, 0.0), subject)
+        c2w = place(poses, subject, None, adam.FROM_CIRCLE if poses == "adam" else None).c2w
+    found = posed(c2w)
+    if found.sum() >= 3:
+        c2w = umeyama(c2w[found][..., 3], subject.truth[found][..., 3]).apply_to_poses(c2w)
+    return c2w, pose_figures(c2w, subject.truth)
 
 
 def _psnr(results: dict[str, Any]) -> str:

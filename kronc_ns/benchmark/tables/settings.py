@@ -5,15 +5,11 @@ from dataclasses import replace
 from functools import partial
 
 from kronc_ns.benchmark import paper
-from kronc_ns.benchmark.peers import START, Method
-from kronc_ns.benchmark.tables import Setting, TableOptions
+from kronc_ns.benchmark.peers import adam
+from kronc_ns.benchmark.peers.methods import START, Method
+from kronc_ns.benchmark.tables.table import Setting, TableOptions
 from kronc_ns.fit.options import KroncConfig
-from kronc_ns.solve.adam import AdamConfig
 
-# The paper's rate for synthetic scenes; with that for real ones (0.001) cameras do not get off the circle far enough.
-_ADAM = KroncConfig(solver="adam", adam=AdamConfig(learning_rate=0.01))
-ADAM_FROM_CIRCLE = replace(_ADAM, init="circular")
-"""The paper's solver from its circle."""
 _SUBSETS = (1.0, 0.75, 0.5, 0.25, 0.1)
 _PRIOR_NOISE = 0.1
 _ON_KEYPOINTS: tuple[Method, ...] = ("kronc", "adam", "keypoints-incremental", "keypoints-global")
@@ -62,7 +58,7 @@ def by_loss(options: TableOptions) -> list[Setting]:
             {"loss": loss},
             "adam",
             noise_px,
-            config=replace(_ADAM, adam=replace(_ADAM.adam, weight_2d=image, weight_3d=world)),
+            config=replace(adam.PAPERS, adam=replace(adam.PAPERS.adam, weight_2d=image, weight_3d=world)),
             paper=_paper(paper.BY_LOSS[loss]),
         )
         for noise_px in options.noise_px
@@ -89,7 +85,7 @@ def by_depths(options: TableOptions) -> list[Setting]:
     rows = []
     for noise_px in options.noise_px:
         for depth_init in ("random", "prior", "prior-fixed"):
-            config = replace(ADAM_FROM_CIRCLE, depth_init=depth_init)
+            config = replace(adam.FROM_CIRCLE, depth_init=depth_init)
             of_paper = {"paper, PSNR": f"{paper.PSNR_BY_DEPTHS[depth_init]} dB"}
             row = _solved({"depths": depth_init}, "adam", noise_px, start=None, config=config, paper=of_paper)
             rows.append(replace(row, depth_noise=None if depth_init == "random" else _PRIOR_NOISE))
@@ -106,7 +102,7 @@ def by_subset(options: TableOptions) -> list[Setting]:
         label, subset = {"images": f"{100 * share:.0f} %"}, partial(_share, share)
         for noise_px in options.noise_px:
             for method in _ON_KEYPOINTS:
-                config = ADAM_FROM_CIRCLE if method == "adam" else None
+                config = adam.FROM_CIRCLE if method == "adam" else None
                 rows.append(_solved(label, method, noise_px, None, config, subset))
             limit = _solved(label, "ceres", noise_px, (0.0, 0.0), None, subset)
             rows.append(replace(limit, labels={**limit.labels, "method": "ceres from the reference"}))
@@ -126,8 +122,6 @@ def _solved(
     """A row that names its method and its noise."""
     of_images = method.startswith("colmap")
     named = {**labels, "method": method, "keypoints": "SIFT" if of_images else f"{noise_px:g} px"}
-    if config is None and method == "adam":
-        config = _ADAM
     return Setting(named, method, noise_px, start, config, views, paper=paper or {})
 
 

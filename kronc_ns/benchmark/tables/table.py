@@ -7,16 +7,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 from rich.console import Console
 
-from kronc_ns.benchmark.peers import START, Method, figures, place
-from kronc_ns.benchmark.rows import hardware, plain
+from kronc_ns.benchmark.figures import Figures, plain
+from kronc_ns.benchmark.machine import hardware, in_words
+from kronc_ns.benchmark.peers.methods import START, Method, place
 from kronc_ns.benchmark.subjects import Subject, from_folder, procedural, thinned, with_noise
+from kronc_ns.benchmark.tables.rendering import Table, number
 from kronc_ns.commands.console import progress_bar
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import atomic_path, write_json
 from kronc_ns.fit.options import KroncConfig
+from kronc_ns.geometry.poses import camera_z
 from kronc_ns.synthetic.variations import noisy_poses
 
 
@@ -111,11 +114,10 @@ def _write(
     """Write what there is of a table; its Markdown."""
     about = (
         f"{len(subjects)} captures ({', '.join(subject.name for subject in subjects)}), seeds from "
-        f"{options.first_seed} on; {machine['cores']} cores ({machine['cpu']}), load {machine['load_1min'] or 0:.1f}, "
-        f"GPU {machine['gpu'] or 'none'}; {seconds:.0f} s in all. Errors: means over the captures of each one's mean / "
-        "median / worst view; seconds and megabytes are those of one capture."
+        f"{options.first_seed} on; {in_words(machine)}; {seconds:.0f} s in all. Errors: means over the captures of "
+        "each one's mean / median / worst view; seconds and megabytes are those of one capture."
     )
-    text = f"## {title}\n\n{markdown(rows)}\n\n{about}\n"
+    text = in_columns(title, rows, about).markdown()
     with atomic_path(options.output_dir / f"{name}.md") as path:
         path.write_text(text, encoding="utf-8")
     content = {"table": name, "title": title, "hardware": machine, "seconds": seconds, "rows": rows}
@@ -123,23 +125,14 @@ def _write(
     return text
 
 
-def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The table as Markdown; a dash where there is no figure."""
+def in_columns(title: str, rows: Sequence[Mapping[str, Any]], about: str) -> Table:
+    """The rows' figures in columns."""
     papers = list(dict.fromkeys(name for row in rows for name in row["paper"]))
-    head = [
-        *rows[0]["labels"],
-        "views placed",
-        "rotation (deg)",
-        "centre (cm)",
-        "AUC 3 / 5 / 30 deg",
-        "s",
-        "MB",
-        *papers,
-    ]
-    lines = [head, ["---"] * len(head)]
+    errors = ("rotation (deg)", "centre (cm)", "AUC 3 / 5 / 30 deg")
+    lines = []
     for row in rows:
         three = [
-            " / ".join(_number(row[key]) for key in keys)
+            " / ".join(number(row[key]) for key in keys)
             for keys in (
                 ("rotation_deg", "median_deg", "worst_deg"),
                 ("centre_cm", "median_cm", "worst_cm"),
@@ -147,39 +140,33 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
             )
         ]
         placed = f"{100 * row['registered']:.0f} %"
-        cost = [_number(row["seconds"]), _number(row["megabytes"])]
+        cost = [number(row["seconds"]), number(row["megabytes"])]
         lines.append([*row["labels"].values(), placed, *three, *cost, *(row["paper"].get(x, "-") for x in papers)])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return Table(title, [*rows[0]["labels"], "views placed", *errors, "s", "MB", *papers], lines, about)
 
 
 def _run(setting: Setting, subject: Subject, seed: int) -> dict[str, float]:
-    subject = with_noise(thinned(subject, setting.views(len(subject.truth))), setting.noise_px, seed)
-    generator = torch.Generator().manual_seed(seed)
+    """Figures of a setting on a subject; of a seed the noise of each kind is the same in every setting."""
+    pixels, poses, distances = (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3))
+    subject = with_noise(thinned(subject, setting.views(len(subject.truth))), setting.noise_px, pixels)
     start = None
     if setting.start is not None:
-        start = noisy_poses(subject.truth, *setting.start, generator)
+        start = noisy_poses(subject.truth, *setting.start, poses)
     if setting.depth_noise is not None:
-        arm = subject.points - subject.truth[:, None, :, 3]
-        depths = (arm * subject.truth[:, None, :, 2]).sum(-1)
-        noise = torch.randn(len(depths), 1 + depths.shape[1], generator=generator, dtype=depths.dtype)
-        depths = depths * (setting.depth_noise * (noise[:, :1] + noise[:, 1:])).exp()
+        depths = camera_z(subject.truth, subject.points)
+        noise = distances.normal(size=(len(depths), 1)) + distances.normal(size=depths.shape)
+        depths = depths * np.exp(setting.depth_noise * noise)
         subject = replace(subject, scene=replace(subject.scene, given_depths=depths))
     try:
-        return figures(place(setting.method, subject, start, setting.config), subject)
+        return place(setting.method, subject, start, setting.config).figures(subject.truth)
     except KroncError as error:
         raise KroncError(f"{', '.join(setting.labels.values())} on {subject.name}: {error}") from None
 
 
-def _means(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+def _means(runs: Sequence[Figures]) -> dict[str, float]:
     """Means over the runs; of the errors over those that placed views enough to have any."""
     means = {}
     for name in runs[0]:
         values = [run[name] for run in runs if math.isfinite(run[name])]
         means[name] = sum(values) / len(values) if values else math.nan
     return means
-
-
-def _number(value: float) -> str:
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:.2g}" if 0 < abs(value) < 0.01 else f"{value:.2f}" if value < 100 else f"{value:.0f}"
