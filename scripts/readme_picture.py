@@ -12,17 +12,16 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import torch
 import tyro
 from PIL import Image
 
-from kronc_ns.files.output import read_json
+from kronc_ns.files.record import read_solution
 from kronc_ns.files.scene_folder import load_scene
 from kronc_ns.files.transforms import read_poses
 from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import umeyama
+from kronc_ns.geometry.camera import reproject
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
-from kronc_ns.solve.objective import reproject
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#888888"  # told apart by colour-blind people
 
@@ -43,8 +42,8 @@ def main(options: Options) -> None:
     scene = load_scene(data)
     poses, reference = read_poses(data / "transforms.json"), read_poses(data / "reference.json")
     names = [name for name in scene.names if name in poses]
-    solved, truth = (torch.stack([source[name] for name in names]) for source in (poses, reference))
-    points = torch.tensor([[np.nan if x is None else x for x in p] for p in read_json(data / "kronc.json")["points"]])
+    solved, truth = (np.stack([source[name] for name in names]) for source in (poses, reference))
+    points = read_solution(data)[1].points
     to_truth = umeyama(solved[..., 3], truth[..., 3])
     circle = circular_poses(len(names), radius_m=5.0)
     start = umeyama(circle[..., 3], truth[..., 3]).rotation @ circle[..., 3:]
@@ -52,7 +51,7 @@ def main(options: Options) -> None:
     figure = plt.figure(figsize=(12, 6.6), layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=[1.25, 1, 1])
     top = figure.add_subplot(grid[:, 0])
-    world = to_truth.apply(points.double())
+    world = to_truth.apply(points)
     for edge in APOLLOCAR3D_66.skeleton:
         top.plot(*world[list(edge), :2].T, color=GREY, lw=0.8)
     top.scatter(*world[:, :2].T, s=6, color="black", label="solved keypoints")
@@ -66,7 +65,7 @@ def main(options: Options) -> None:
     image = np.asarray(Image.open(data / names[options.view]).convert("RGB"))
     axis = figure.add_subplot(grid[0, 1:])
     axis.imshow(image, extent=(0, image.shape[1], image.shape[0], 0))
-    uv = reproject(points.double(), solved[options.view : options.view + 1], scene.camera)[0]
+    uv = reproject(points, solved[options.view : options.view + 1], scene.camera)[0]
     seen = scene.visibility[scene.names.index(names[options.view])] > 0
     detected = scene.keypoints[scene.names.index(names[options.view])]
     axis.scatter(*detected[seen, :2].T, s=45, facecolors="none", edgecolors="white", linewidths=1.3, label="detected")

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.starts import MIN_POINTS, Hypothesis, usable_views
+from kronc_ns.geometry.poses import invert, make_pose
 from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.solve.covariance import camera_covariance
@@ -102,8 +103,9 @@ def adjust_starts(
 
 
 def _attempt(start: Hypothesis, found: Hypothesis, problem: Problem, result: LmResult) -> Attempt:
-    steps = [result.path[i].c2w for i in kept_steps(len(result.path))]
-    path = np.stack(steps) if steps else np.empty((0, len(start.scene), 3, 4))
+    steps = [result.path[i] for i in kept_steps(len(result.path))]
+    rotation = np.array([step.rotation for step in steps]).reshape(len(steps), len(start.scene), 3, 3)
+    translation = np.array([step.translation for step in steps]).reshape(len(steps), len(start.scene), 3)
     return Attempt(
         start=start,
         found=found,
@@ -115,7 +117,7 @@ def _attempt(start: Hypothesis, found: Hypothesis, problem: Problem, result: LmR
         iterations=len(result.loss),
         converged=result.converged,
         history={"step": [float(step) for step in range(1, len(result.loss) + 1)], "loss": list(result.loss)},
-        path=np.where(start.used[:, None, None], path, math.nan),
+        path=np.where(start.used[:, None, None], invert(make_pose(rotation, translation)), math.nan),
     )
 
 

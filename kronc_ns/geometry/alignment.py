@@ -39,13 +39,14 @@ def umeyama(
     Coincident source points carry no scale or rotation: the similarity is then a translation.
     """
     share = np.ones(len(source)) if weight is None else weight
-    share = (share / share.sum())[:, None]
-    mean_x, mean_y = (share * source).sum(0), (share * target).sum(0)
+    share = share / share.sum()
+    mean_x, mean_y = share @ source, share @ target
     x, y = source - mean_x, target - mean_y
-    variance = (share * x * x).sum()
+    weighted = share[:, None] * x
+    variance = np.vdot(weighted, x)
     rotation, scale = np.eye(3), 1.0
     if variance > np.finfo(np.float64).tiny:
-        u, singular, vh = np.linalg.svd(y.T @ (share * x))
+        u, singular, vh = np.linalg.svd(y.T @ weighted)
         sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vh))])
         rotation = (u * sign) @ vh
         scale = float((singular * sign).sum() / variance)

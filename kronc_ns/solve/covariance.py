@@ -2,8 +2,8 @@
 
 Relative means: no common shift, turn or growth of the points that are seen counts (inner constraints; docs/solver.md),
 so what remains is the camera's error relative to the object. Any generalised inverse will do, since the gauge is
-projected out; a stiff spring makes the matrix regular. A camera follows the points by -W^T Y, and the gauge's part of
-their error, motion G^T, is taken off it: with Z = Y L^-T and G = L^-1 gauge its covariance is
+projected out; without a prior a stiff spring makes the matrix regular. A camera follows the points by -W^T Y, and the
+gauge's part of their error, motion G^T, is taken off it: with Z = Y L^-T and G = L^-1 gauge its covariance is
 W^T W + (W^T Z + motion G^T) (W^T Z + motion G^T)^T.
 """
 
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from kronc_ns.geometry.rotations import skew
 from kronc_ns.solve import schur
 from kronc_ns.solve.compiled import compiled
 from kronc_ns.solve.linear import dot, factor, forward
@@ -45,8 +46,9 @@ def camera_covariance(
     work.weight[:] = data.own
     schur.reduce_system(data, now, work, _DAMPING, sigma_px**2 * shape_weight, sigma_px**2)
     matrix = work.matrix
-    gauge, inverse, mean = _gauge(now.points, np.unique(data.joint), len(matrix))
-    matrix += np.trace(matrix) / len(matrix) * (gauge.T @ gauge)
+    gauge, inverse, mean = _gauge(now.points, np.flatnonzero((chosen.weight > 0).any(0)), len(matrix))
+    if problem.shape is None:  # a prior makes it regular, and would be made more of
+        matrix += np.trace(matrix) / len(matrix) * (gauge.T @ gauge)
     if not factor(matrix):
         covariance[:] = np.nan
         return covariance
@@ -93,12 +95,12 @@ def _gauge(
     """
     mean = points[seen].mean(0) if len(seen) else np.zeros(3)
     arm = points[seen] - mean
-    turned = np.cross(np.eye(3)[:, None], arm)  # [axis of the turn, point, component]
+    turned = -skew(arm)  # [point, component, axis of the turn]
     moves = np.zeros((12, size))
     for c in range(3):
         at = c * len(points) + seen
         moves[c, at] = 1.0
-        moves[3:6, at] = turned[..., c]
+        moves[3:6, at] = turned[:, c].T
         moves[6, at] = arm[:, c]
     square = moves[:7] @ moves[:7].T + _TRACE * np.eye(7)
     inverse = np.linalg.inv(np.linalg.cholesky(square))

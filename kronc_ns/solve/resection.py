@@ -89,7 +89,7 @@ def locate(views: Views, exact: bool = False, rival: Int[np.ndarray, "m"] | None
 
 
 def unexplained(views: Views, w2c: Float[np.ndarray, "m 3 4"]) -> Float[np.ndarray, "m"]:
-    """`Located.cost` of each view at a given pose; NaN where there is none."""
+    """`Located.cost` of each view at a given pose; 1 where there is none."""
     return _refined(_rows(views), np.arange(len(w2c)), w2c, np.full(len(w2c), np.inf), 0)[1]
 
 
@@ -141,7 +141,7 @@ def _rows(views: Views) -> _Rows:
         views.uv[view, column],
         views.weight[view, column],
         np.array(views.focal),
-        views.tolerance_px,
+        np.ascontiguousarray(views.tolerance_px),
     )
 
 
@@ -321,7 +321,7 @@ def _best_guesses(views: Views, count: int) -> Float[np.ndarray, "m g 3 4"]:
     flat = directions.reshape(-1, 9).T
     error = square.reshape(-1, 81) @ products
     depth = -pull[:, 2] @ flat
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(depth > 0, error / np.square(depth), np.inf)
     grid = error.reshape(-1, len(_ROLLS_DEG), _AZIMUTHS, len(_ELEVATIONS_DEG))
     lowest = grid <= np.minimum(np.roll(grid, 1, axis=2), np.roll(grid, -1, axis=2))  # minima over the azimuth

@@ -11,12 +11,12 @@ from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.starts import start_from_poses, start_from_template
 from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.geometry.poses import make_pose
-from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.synthetic.scenes import make_capture
 from tests.conftest import scene_of
+from tests.fit.common import PLAIN
 
 CONFIG = KroncConfig()
-PLAIN = KeypointSchema("things-66", tuple(f"thing {j}" for j in range(66)), tuple(range(66)))
 
 
 def test_an_attempt_knows_where_it_began_and_what_it_found(attempt, lap, lap_start):

@@ -11,11 +11,17 @@ from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import Similarity
 from kronc_ns.geometry.rotations import rotation_angle_deg, so3_exp
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66, KeypointSchema
-from kronc_ns.keypoints.template import CarDimensions, car_template, keypoints_of
+from kronc_ns.keypoints.template import CarDimensions, CarTemplate, car_template, keypoints_of
 from kronc_ns.synthetic.car import CarShape, build_car
 
-TEMPLATE = car_template(APOLLOCAR3D_66)
-assert TEMPLATE is not None
+
+def the_template() -> CarTemplate:
+    template = car_template(APOLLOCAR3D_66)
+    assert template is not None
+    return template
+
+
+TEMPLATE = the_template()
 FRAMES = {"rough": rough_frame, "template": template_frame}
 WORLD = Similarity(1.7, so3_exp(np.array([0.4, -1.1, 0.7])), np.array([0.5, -2.0, 3.0]))
 

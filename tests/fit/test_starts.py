@@ -119,8 +119,10 @@ def test_views_are_located_without_a_pose_and_swapped_ones_told(scene, lap):
     assert (cost[chosen] < LOST / 4).all()
     off = invert(c2w[chosen])[..., 3] - invert(lap.c2w[chosen])[..., 3]
     assert np.median(np.linalg.norm(off, axis=-1)) < 0.1
-    views = single_views(scene, lap.points, chosen, 0.7)
-    assert_allclose(cost[chosen], unexplained(views, invert(c2w[chosen])), rtol=1e-9, err_msg="its cost is that of its pose")
+    views = single_views(scene, lap.points, chosen, 0.7)  # its cost is that of its pose
+    assert_allclose(
+        cost[chosen], unexplained(views, invert(c2w[chosen])), rtol=1e-9, err_msg="its cost is that of its pose"
+    )
 
 
 def test_nothing_asked_nothing_located(scene, lap):

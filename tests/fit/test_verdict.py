@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 
 from kronc_ns.fit.attempts import measured
 from kronc_ns.fit.options import KroncConfig
@@ -90,7 +90,8 @@ def off_by(scene: Scene, true: Solution, sigmas: float) -> Scene:
     rng = np.random.default_rng(0)
     angle = rng.uniform(0, 2 * math.pi, scene.seen.shape)
     length = np.where(rng.random(scene.seen.shape) < 0.1, sigmas, 1.1774)
-    uv = reproject(true.points, true.c2w, scene.camera) + length[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    off = length[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    uv = reproject(true.points, true.c2w, scene.camera) + off
     return replace(scene, keypoints=np.concatenate([uv, scene.visibility[..., None]], axis=-1))
 
 

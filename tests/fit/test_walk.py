@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from kronc_ns.fit.starts import circular_poses
-from kronc_ns.fit.walk import interpolate_walk
+from kronc_ns.fit.walk import Interpolated, interpolate_walk
 from kronc_ns.geometry.poses import posed
 from kronc_ns.geometry.rotations import rotation_angle_deg
 from kronc_ns.synthetic.scenes import walk_poses
@@ -29,8 +29,15 @@ def all_but(views: int, *unknown: int) -> np.ndarray:
     return ~np.isin(np.arange(views), unknown)
 
 
-def hidden(c2w: np.ndarray, known: np.ndarray) -> np.ndarray:
-    return np.where(known[:, None, None], c2w, math.nan)
+def interpolated(truth: np.ndarray, known: np.ndarray) -> Interpolated | None:
+    """The walk, told the poses of the known views only."""
+    return interpolate_walk(np.where(known[:, None, None], truth, math.nan), known)
+
+
+def completed(truth: np.ndarray, known: np.ndarray) -> Interpolated:
+    placed = interpolated(truth, known)
+    assert placed is not None
+    return placed
 
 
 def errors(c2w: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -42,8 +49,7 @@ def errors(c2w: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_a_fifth_of_a_walk_is_placed_about_as_well_as_the_hand_was_steady(options):
     for seed in range(2):
         truth, known = walk(seed=seed, **options), holes(60, 0.2, seed)
-        placed = interpolate_walk(hidden(truth, known), known)
-        assert placed is not None
+        placed = completed(truth, known)
         rotation, centre = errors(placed.c2w, truth)
         assert np.median(rotation[~known]) < 3.0  # every view is shaken by a degree about each axis
         assert np.median(centre[~known]) < 0.1
@@ -53,7 +59,7 @@ def test_a_fifth_of_a_walk_is_placed_about_as_well_as_the_hand_was_steady(option
 
 def test_known_views_are_where_they_were():
     truth, known = walk(), holes(60, 0.2)
-    placed = interpolate_walk(hidden(truth, known), known)
+    placed = completed(truth, known)
     rotation, centre = errors(placed.c2w[known], truth[known])
     assert rotation.max() < 1e-4
     assert centre.max() < 1e-8
@@ -65,7 +71,7 @@ def test_the_sigmas_say_how_far_off_it_is():
     share_rotation, share_centre = [], []
     for seed in range(6):
         truth, known = walk(40, seed), holes(40, 0.2, seed)
-        placed = interpolate_walk(hidden(truth, known), known)
+        placed = completed(truth, known)
         rotation, centre = errors(placed.c2w, truth)
         share_rotation.append((rotation / placed.sigma_rot_deg)[~known])
         share_centre.append((centre / placed.sigma_trans_m)[~known])
@@ -76,13 +82,13 @@ def test_the_sigmas_say_how_far_off_it_is():
 
 def test_wider_gaps_are_less_certain():
     truth, known = walk(120), all_but(120, 20, *range(60, 67))
-    placed = interpolate_walk(hidden(truth, known), known)
+    placed = completed(truth, known)
     assert placed.sigma_trans_m[63] > placed.sigma_trans_m[20]
 
 
 def test_a_perfect_circle_is_continued_exactly():
     truth, known = circular_poses(36, 5.0), all_but(36, 0, 7, 8, 20, 35)
-    placed = interpolate_walk(hidden(truth, known), known)
+    placed = completed(truth, known)
     rotation, centre = errors(placed.c2w, truth)
     assert rotation.max() < 1e-4
     assert centre.max() < 1e-8
@@ -92,18 +98,18 @@ def test_a_perfect_circle_is_continued_exactly():
 
 def test_views_in_any_order_are_no_walk():
     truth, known = walk()[np.random.default_rng(0).permutation(60)], holes(60, 0.2)
-    assert interpolate_walk(hidden(truth, known), known) is None
+    assert interpolated(truth, known) is None
 
 
 @pytest.mark.parametrize("count", range(5))
 def test_a_few_views_are_no_walk(count):
     known = np.arange(60) < count
-    assert interpolate_walk(hidden(walk(), known), known) is None
+    assert interpolated(walk(), known) is None
 
 
 def test_gaps_that_are_too_wide_stay_open():
     truth, known = walk(), all_but(60, *range(20, 34), 45)  # 14 views are 90 degrees
-    placed = interpolate_walk(hidden(truth, known), known)
+    placed = completed(truth, known)
     assert np.isnan(placed.c2w[20:34]).all()
     assert np.isnan(placed.sigma_rot_deg[20:34]).all()
     assert np.isfinite(placed.c2w[45]).all()
@@ -111,7 +117,7 @@ def test_gaps_that_are_too_wide_stay_open():
 
 def test_a_walk_is_continued_a_little_only():
     truth, known = walk(), all_but(60, 0, 1, *range(50, 60))
-    placed = interpolate_walk(hidden(truth, known), known)
+    placed = completed(truth, known)
     assert posed(placed.c2w).tolist() == [True] * 53 + [False] * 7
     assert errors(placed.c2w[:2], truth[:2])[1].max() < 0.3
     assert errors(placed.c2w[50:53], truth[50:53])[1].max() < 0.6
@@ -119,7 +125,7 @@ def test_a_walk_is_continued_a_little_only():
 
 def test_poses_are_poses():
     truth, known = walk(), holes(60, 0.3, 3)
-    placed = interpolate_walk(hidden(truth, known), known)
+    placed = completed(truth, known)
     rotation = placed.c2w[..., :3]
     assert_allclose(rotation.swapaxes(-1, -2) @ rotation, np.tile(np.eye(3), (60, 1, 1)), rtol=0, atol=1e-9)
     assert (np.linalg.det(rotation) > 0).all()

@@ -10,7 +10,7 @@ from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture
 from tests.plugin.commands import InProcess
 
-pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
+pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio, pytest.mark.usefixtures("without_lpips")]
 
 
 def test_a_field_on_true_poses_beats_one_on_the_circle(tmp_path, monkeypatch):

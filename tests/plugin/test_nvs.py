@@ -9,7 +9,7 @@ from kronc_ns.benchmark.suites.rows import measure_rows
 from kronc_ns.benchmark.suites.trainings import Trainings
 from tests.plugin.commands import InProcess
 
-pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
+pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio, pytest.mark.usefixtures("without_lpips")]
 
 RAYS = ["--pipeline.datamanager.train-num-rays-per-batch", "400"]
 SHORT = {

@@ -1,7 +1,7 @@
 """The solver's equations by the book: residuals in torch, derivatives by autograd, systems dense.
 
-Unknowns in a row: 6 of each camera (turn w and shift t of p -> exp(w) p + t), the points' (x of all, y of all, z of all;
-none where they are known), the refined intrinsics (logarithm of the focal length's factor, then k1).
+Unknowns in a row: 6 of each camera (turn w and shift t of p -> exp(w) p + t), the points' (x of all, y of all, z of
+all; none where they are known), the refined intrinsics (logarithm of the focal length's factor, then k1).
 """
 
 from collections.abc import Callable

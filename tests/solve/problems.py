@@ -1,5 +1,8 @@
 """Small problems for the solver's tests."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -7,13 +10,26 @@ from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import Similarity, pose_errors
 from kronc_ns.geometry.rotations import so3_exp
 from kronc_ns.solve import schur
-from kronc_ns.solve.problem import Problem, State
+from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State
 from kronc_ns.synthetic.variations import noisy_poses
 
 FOCAL = (400.0, 390.0)
 SIMILARITY = Similarity(1.7, so3_exp(np.array([0.4, -1.1, 0.7])), np.array([0.5, -2.0, 3.0]))
 HALF_TURN = np.array([-1.0, 1.0, -1.0])
 """About the camera's y axis."""
+VARIANTS = {
+    "plain": (),
+    "focal": ("focal",),
+    "k1": ("k1",),
+    "focal and k1": ("focal", "k1"),
+    "shape": ("shape",),
+    "orbit": ("orbit",),
+    "points known": ("known",),
+    "points known, focal": ("known", "focal", "orbit"),
+    "everything": ("k1", "focal", "shape", "orbit"),
+}
+BELIEF, VARIANCE = 0.7, 2.3
+"""Weights of the shape prior and of expected centres."""
 
 
 def randn(*shape: int, seed: int = 0) -> np.ndarray:
@@ -78,3 +94,30 @@ def lengths(problem: Problem, state: State) -> Float[np.ndarray, "n j"]:
     length = np.zeros(problem.weight.shape)
     length[problem.weight > 0] = evaluated(problem, state).length
     return length
+
+
+def shape_prior(joints: int) -> ShapePrior:
+    root = randn(3 * joints, 3 * joints, seed=20)
+    return ShapePrior.of(0.5 * randn(joints, 3, seed=21), root @ root.T / joints)
+
+
+def orbit_prior(truth: State) -> OrbitPrior:
+    centre = truth.c2w[..., 3] + 0.1 * randn(*truth.translation.shape, seed=22)
+    sigma = np.full(len(centre), 0.2)
+    sigma[1] = math.inf  # nothing is expected of this view
+    return OrbitPrior(centre, sigma)
+
+
+def posed(variant: str, views: int = 4, joints: int = 6) -> tuple[Problem, State, np.ndarray]:
+    """A problem, a state off the solution with a bent lens, and weights of all detections."""
+    options = VARIANTS[variant]
+    problem, truth = scene(views, joints, noise_px=2.0)
+    problem = replace(
+        problem,
+        refine=tuple(name for name in options if name in ("focal", "k1")),
+        shape=shape_prior(joints) if "shape" in options else None,
+        orbit=orbit_prior(truth) if "orbit" in options else None,
+        points_known="known" in options,
+    )
+    state = replace(started(truth), log_growth=0.1, k1=-0.07)
+    return problem, state, problem.weight * np.random.default_rng(5).random(problem.weight.shape)

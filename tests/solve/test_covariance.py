@@ -188,8 +188,8 @@ def test_a_view_with_too_few_points_for_a_pose_is_no_trouble_to_the_others(count
     before, after = (np.diagonal(x, axis1=1, axis2=2) for x in (whole, thin))
     assert (after[kept] > 0.9 * before[kept]).all()
     assert (after[kept] < 3 * before[kept]).all()
-    print(before, after, np.linalg.eigvals(np.linalg.solve(whole[4], thin[4])).real.max())
-    assert after[4].max() > 3 * before[4].max()
+    growth = np.linalg.eigvals(np.linalg.solve(whole[4], thin[4])).real.max()  # of the variance that grows most
+    assert growth > (20 if count == 3 else 1e6)
 
 
 def test_a_state_that_is_no_number_has_no_covariance():

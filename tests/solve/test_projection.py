@@ -1,4 +1,4 @@
-"""Formulas of the projection: each derivative against a complex step, and one result for numbers, arrays and tensors."""
+"""Formulas of the projection: derivatives against complex steps; the same for numbers, arrays and tensors."""
 
 import numpy as np
 import pytest

@@ -8,50 +8,23 @@ import pytest
 
 from kronc_ns.geometry.rotations import skew
 from kronc_ns.solve import robust, schur
-from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State
+from kronc_ns.solve.problem import Problem, State
 from tests.solve import book
-from tests.solve.problems import HALF_TURN, SIMILARITY, evaluated, lengths, moved, randn, scene, started
-
-VARIANTS = {
-    "plain": (),
-    "focal": ("focal",),
-    "k1": ("k1",),
-    "focal and k1": ("focal", "k1"),
-    "shape": ("shape",),
-    "orbit": ("orbit",),
-    "points known": ("known",),
-    "points known, focal": ("known", "focal", "orbit"),
-    "everything": ("k1", "focal", "shape", "orbit"),
-}
-VIEWS, JOINTS = 4, 6
-BELIEF, VARIANCE = 0.7, 2.3
-
-
-def shape_prior(joints: int) -> ShapePrior:
-    root = randn(3 * joints, 3 * joints, seed=20)
-    return ShapePrior.of(0.5 * randn(joints, 3, seed=21), root @ root.T / joints)
-
-
-def orbit_prior(truth: State) -> OrbitPrior:
-    centre = truth.c2w[..., 3] + 0.1 * randn(*truth.translation.shape, seed=22)
-    sigma = np.full(len(centre), 0.2)
-    sigma[1] = math.inf  # nothing is expected of this view
-    return OrbitPrior(centre, sigma)
-
-
-def posed(variant: str, views: int = VIEWS, joints: int = JOINTS) -> tuple[Problem, State, np.ndarray]:
-    """A problem, a state off the solution with a bent lens, and weights of all detections."""
-    options = VARIANTS[variant]
-    problem, truth = scene(views, joints, noise_px=2.0)
-    problem = replace(
-        problem,
-        refine=tuple(name for name in options if name in ("focal", "k1")),
-        shape=shape_prior(joints) if "shape" in options else None,
-        orbit=orbit_prior(truth) if "orbit" in options else None,
-        points_known="known" in options,
-    )
-    state = replace(started(truth), log_growth=0.1, k1=-0.07)
-    return problem, state, problem.weight * np.random.default_rng(5).random(problem.weight.shape)
+from tests.solve.problems import (
+    BELIEF,
+    HALF_TURN,
+    SIMILARITY,
+    VARIANCE,
+    VARIANTS,
+    evaluated,
+    lengths,
+    moved,
+    posed,
+    randn,
+    scene,
+    shape_prior,
+    started,
+)
 
 
 class Step:

@@ -41,9 +41,6 @@ Method = Literal[
 Cauchy loss; colmap-...: COLMAP's mappers on SIFT features (all of them, or the vehicle's); keypoints-...: the same
 mappers on the keypoints."""
 
-START = (4.0, 0.5)
-"""The paper's noise of initial poses: degrees, metres."""
-
 
 @dataclass(frozen=True)
 class Placed:

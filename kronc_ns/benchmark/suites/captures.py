@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from kronc_ns.benchmark.figures import pose_figures
+from kronc_ns.benchmark.paper import START
 from kronc_ns.benchmark.peers.ceres import bundle_adjustment
 from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.errors import KroncError
@@ -30,8 +31,6 @@ from kronc_ns.synthetic.variations import noisy_poses, on_wheels
 
 REPORT_SEEDS = 100
 """Seeds below are for reports; what is tuned is tuned on seeds from here on."""
-USUAL_START = (4.0, 0.5)
-"""Noise of the start in degrees and metres, where a row names none."""
 DEFAULT = KroncConfig()
 """What a user gets: poses that come with a scene are tried first."""
 _TUNING_SHAPES = 40  # the first shapes of a file were looked at while building, the others are held out
@@ -109,9 +108,7 @@ def capture_shape(
     return observe(points, c2w, default_camera(preset), rng, noise_px, outliers=outliers), rng
 
 
-def noisy_start(
-    capture: Capture, seed: int, pose_noise: tuple[float, float] = USUAL_START
-) -> Float[np.ndarray, "n 3 4"]:
+def noisy_start(capture: Capture, seed: int, pose_noise: tuple[float, float] = START) -> Float[np.ndarray, "n 3 4"]:
     """The true poses with (degrees, metres) of noise."""
     return noisy_poses(capture.c2w, *pose_noise, np.random.default_rng((seed, 1)))  # not the capture's own draws again
 

@@ -11,14 +11,14 @@ _START = "from (4 deg, 0.5 m) noise"
 _DETECTED_PX = 400  # width of the paper's images, in which a detector looks
 
 _KINDS: tuple[tuple[PoseKind, tuple[Limit, ...]], ...] = (
-    (EXACT, (Limit("psnr", at_least=28), NONE_LOST)),
+    (EXACT, (Limit("psnr", at_least=28.0), NONE_LOST)),
     (
         PoseKind(f"solved {_START}, exact keypoints", "solved", "solved"),
         (Limit("psnr_below_exact", at_most=0.3), NONE_LOST),
     ),
     (
         PoseKind(f"solved {_START}, keypoints of 1 px at 400x400", "solved_1px", "solved", 1 / _DETECTED_PX),
-        (Limit("psnr_below_exact", at_most=1), NONE_LOST),
+        (Limit("psnr_below_exact", at_most=1.0), NONE_LOST),
     ),
     (PoseKind(f"{_START}, not solved", "given", "given"), ()),
 )

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from kronc_ns.benchmark.figures import Figures
+from kronc_ns.benchmark.paper import START
 from kronc_ns.benchmark.peers.adam import FROM_POSES
 from kronc_ns.benchmark.peers.ceres import bundle_adjustment
 from kronc_ns.benchmark.subjects import capture_scene
 from kronc_ns.benchmark.suites.captures import (
     DEFAULT,
-    USUAL_START,
     best_poses,
     noisy_start,
     solution_figures,
@@ -36,9 +36,7 @@ over 3). Camera errors lie between, their ellipsoids having one or two long axes
 """
 
 
-def from_start(
-    seed: int, start: tuple[float, float] = USUAL_START, views: int = 100, adam: bool = False
-) -> dict[str, float]:
+def from_start(seed: int, start: tuple[float, float] = START, views: int = 100, adam: bool = False) -> dict[str, float]:
     """Hemisphere, 1 px, from noisy poses; with ``adam`` the paper's 10,000 steps beside."""
     capture = make_capture("carpatch", views, seed, noise_px=1.0)
     given = noisy_start(capture, seed, start)

@@ -33,7 +33,11 @@ def pose_rows(options: Options) -> list[Row]:
                 lambda seed, preset=preset: measures.without_pose(
                     capture_shape(cars(seed), preset, seed, outliers=0.1)[0]
                 ),
-                (Limit("rotation_deg", "worst", at_most=1), Limit("rotation_ratio", "median", at_most=1.05), NONE_LOST),
+                (
+                    Limit("rotation_deg", "worst", at_most=1.0),
+                    Limit("rotation_ratio", "median", at_most=1.05),
+                    NONE_LOST,
+                ),
                 _MEDIANS,
             )
             for preset, where in _PRESETS
@@ -70,9 +74,9 @@ def pose_rows(options: Options) -> list[Row]:
                     *capture_shape(cars(seed), preset, seed), given, seed
                 ),
                 (
-                    Limit("missed", "total", at_most=0),
-                    Limit("wrong", "total", at_most=0),
-                    Limit("found", "total", at_least=1),
+                    Limit("missed", "total", at_most=0.0),
+                    Limit("wrong", "total", at_most=0.0),
+                    Limit("found", "total", at_least=1.0),
                     NONE_LOST,
                 ),
                 _MEDIANS,
@@ -87,9 +91,9 @@ def pose_rows(options: Options) -> list[Row]:
             20,
             lambda seed: measures.emptied_views(*capture_shape(cars(seed), "walk", seed)),
             (
-                Limit("completed_percent", "worst", at_least=100),
-                Limit("completed_rotation_deg", "median", at_most=3),
-                Limit("completed_centre_cm", "median", at_most=25),
+                Limit("completed_percent", "worst", at_least=100.0),
+                Limit("completed_rotation_deg", "median", at_most=3.0),
+                Limit("completed_centre_cm", "median", at_most=25.0),
                 NONE_LOST,
             ),
             {"median": ("solved_rotation_deg",)},
@@ -100,7 +104,7 @@ def pose_rows(options: Options) -> list[Row]:
                 f"{where}, {_START}; {measures.INTERVAL} sigma, relative to the points",
                 20,
                 partial(measures.coverage, preset=preset),
-                tuple(Limit(f"{of}_percent", at_least=90, at_most=98) for of in ("rotation", "centre")),
+                tuple(Limit(f"{of}_percent", at_least=90.0, at_most=98.0) for of in ("rotation", "centre")),
                 {"mean": ("rotation_error_over_sigma", "centre_error_over_sigma")},
             )
             for preset, where in _PRESETS
@@ -186,7 +190,7 @@ def _other_walks(cars: Shapes) -> list[Row]:
             f"{_WALK}, {_NO_START}, {cars}",
             10,
             lambda seed, make=make: measures.without_pose(make(seed)),
-            (Limit("rotation_deg", "worst", at_most=1), NONE_LOST),
+            (Limit("rotation_deg", "worst", at_most=1.0), NONE_LOST),
             _MEDIANS,
         )
         for name, make in makes.items()

@@ -72,7 +72,7 @@ class Limit:
         return self.at_least <= reached <= self.at_most
 
 
-NONE_LOST = Limit("seeds_lost", "total", at_most=0)
+NONE_LOST = Limit("seeds_lost", "total", at_most=0.0)
 """Every seed is solved, and every view of it has a pose."""
 
 

@@ -26,8 +26,8 @@ def speed_rows(options: Options) -> list[Row]:
             20,
             measures.against_ceres,
             (
-                Limit("solve_over_iterative_schur", "median", at_most=1),
-                Limit("adjustment_over_fastest", "median", at_most=1),
+                Limit("solve_over_iterative_schur", "median", at_most=1.0),
+                Limit("adjustment_over_fastest", "median", at_most=1.0),
                 NONE_LOST,
             ),
             {
@@ -46,8 +46,8 @@ def speed_rows(options: Options) -> list[Row]:
             max(options.adam_seeds, 1),
             measures.against_adam,
             (
-                Limit("times_faster", "median", at_least=600),
-                Limit("seeds_less_accurate", "total", at_most=0),
+                Limit("times_faster", "median", at_least=600.0),
+                Limit("seeds_less_accurate", "total", at_most=0.0),
                 NONE_LOST,
             ),
             {
@@ -62,7 +62,7 @@ def speed_rows(options: Options) -> list[Row]:
             f"walk 480x270, 100 views, 1 px, 10 % outliers, {options.shapes}; over {_CAPTURE}, 100 views",
             5,
             partial(measures.without_pose, shapes=options.shapes),
-            (Limit("over_plain", "median", at_most=2), NONE_LOST),
+            (Limit("over_plain", "median", at_most=2.0), NONE_LOST),
             {**_OF_A_SOLVE, "median": (*_OF_A_SOLVE["median"], "plain_milliseconds")},
         ),
         Row(
@@ -90,7 +90,7 @@ def speed_rows(options: Options) -> list[Row]:
             (
                 Limit("over_one_core", "median", at_least=1.9),
                 Limit("apart", "worst", at_most=1e-6),
-                Limit("failed_scenes", "total", at_most=0),
+                Limit("failed_scenes", "total", at_most=0.0),
             ),
             {"median": ("scenes_per_s", "scenes_per_s_on_one_core"), "worst": ("rotation_deg",)},
         ),
@@ -119,7 +119,7 @@ def speed_rows(options: Options) -> list[Row]:
             "that of the next one",
             1,
             processes.first_call,
-            (Limit("processor_s_more", "median", at_most=10),),
+            (Limit("processor_s_more", "median", at_most=10.0),),
             {"median": ("first_processor_s", "again_processor_s")},
         ),
     ]

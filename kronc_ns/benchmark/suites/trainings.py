@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,17 +44,14 @@ class Trainings:
     """Trained and tested fields of one run of the suite; each is made once, however many rows ask for it.
 
     A capture is a rendered car from a hemisphere of ``views`` cameras, every fifth for testing, ``width`` pixels wide
-    and high. Test views have poses of the same kind as training views. ``options`` are added to `ns-train`.
+    and high. Test views have poses of the same kind as training views.
     """
 
-    def __init__(
-        self, folder: Path, commands: Commands, views: int = 75, width: int = 160, options: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, folder: Path, commands: Commands, views: int = 75, width: int = 160) -> None:
         self._folder = folder
         self._commands = commands
         self._views = views
         self._width = width
-        self._options = options
         self._lock = Lock()
         self._solving = Lock()  # one after the other: the solver uses all cores, and compiles itself at first
         self._made: dict[Hashable, Future[Any]] = {}
@@ -85,9 +82,8 @@ class Trainings:
         data = self._once(self._posed, kind, seed)
         out = self._folder / f"seed_{seed}"
         begin = time.perf_counter()
-        config = train(
-            data, method, out / "runs", self._options, ["--eval-interval", str(EVAL_INTERVAL)], self._commands
-        )
+        parser = ["--eval-interval", str(EVAL_INTERVAL)]
+        config = train(data, method, out / "runs", parser=parser, commands=self._commands)
         trained = time.perf_counter()
         pictures = out / "pictures" / method / kind.folder
         result = json.loads(

@@ -6,7 +6,7 @@ from functools import partial
 
 from kronc_ns.benchmark import paper
 from kronc_ns.benchmark.peers import adam
-from kronc_ns.benchmark.peers.methods import START, Method
+from kronc_ns.benchmark.peers.methods import Method
 from kronc_ns.benchmark.tables.table import Setting, TableOptions
 from kronc_ns.fit.options import KroncConfig
 
@@ -26,7 +26,7 @@ def main(options: TableOptions) -> list[Setting]:
     rows = []
     for noise_px in options.noise_px:
         for method in ("kronc", "adam", "ceres"):
-            of_paper = _paper(paper.BY_NOISE[START]) if method == "adam" else {}
+            of_paper = _paper(paper.BY_NOISE[paper.START]) if method == "adam" else {}
             rows.append(_solved({}, method, noise_px, paper=of_paper))
         rows.append(_solved({"start": "none"}, "kronc", noise_px, start=None))
         for method in ("keypoints-incremental", "keypoints-global"):
@@ -114,7 +114,7 @@ def _solved(
     labels: dict[str, str],
     method: Method,
     noise_px: float,
-    start: tuple[float, float] | None = START,
+    start: tuple[float, float] | None = paper.START,
     config: KroncConfig | None = None,
     views: Callable[[int], int] = int,
     paper: dict[str, str] | None = None,

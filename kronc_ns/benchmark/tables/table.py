@@ -12,7 +12,8 @@ from rich.console import Console
 
 from kronc_ns.benchmark.figures import Figures, plain
 from kronc_ns.benchmark.machine import hardware, in_words
-from kronc_ns.benchmark.peers.methods import START, Method, place
+from kronc_ns.benchmark.paper import START
+from kronc_ns.benchmark.peers.methods import Method, place
 from kronc_ns.benchmark.subjects import Subject, from_folder, procedural, thinned, with_noise
 from kronc_ns.benchmark.tables.rendering import Table, number
 from kronc_ns.commands.console import progress_bar

@@ -1,4 +1,5 @@
 """nerfstudio's splatfacto where there is no CUDA."""
+# shapes unchecked: hundreds of calls of torch a step pass through `StayOnCpu`, and no shapes are declared here
 
 import inspect
 from collections.abc import Callable, Mapping

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jaxtyping import Bool, Float
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
-from torch import Tensor
 
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import REPORT_FILE, atomic_path, is_report
@@ -109,16 +109,16 @@ def _px(value: float) -> str:
 
 
 def _left_out(
-    scene: Scene, solution: Solution, error: Float[Tensor, "n j"], inlier: Bool[Tensor, "n j"]
+    scene: Scene, solution: Solution, error: Float[np.ndarray, "n j"], inlier: Bool[np.ndarray, "n j"]
 ) -> list[tuple[str, Sequence[str]]]:
     """What has no part in the solution or not as it was given, with its number, and the names."""
     views = solution.views
-    known = int((~error.isnan()).sum())
+    known = int((~np.isnan(error)).sum())
     odd = known - int(inlier.sum())
     failed = [f"{view.name}: {view.reason}" for view in views if view.status is ViewStatus.FAILED]
     completed = [f"{view.name}: {view.reason}" for view in views if view.status is ViewStatus.COMPLETED]
     swapped = [view.name for view in views if view.swapped]
-    missing = (~solution.points.isfinite().all(-1)).tolist()
+    missing = (~np.isfinite(solution.points).all(-1)).tolist()
     unknown = [name for name, unsolved in zip(scene.schema.keypoints, missing, strict=True) if unsolved]
     said = [
         ("Views without a pose, which are not in transforms.json", failed),

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import plotly.graph_objects as go
-import torch
 from jaxtyping import Bool, Float
 from plotly.subplots import make_subplots
-from torch import Tensor
 
 from kronc_ns.geometry.camera import Camera
-from kronc_ns.geometry.poses import known, transform
+from kronc_ns.geometry.poses import posed, transform
 from kronc_ns.scene import Scene
 from kronc_ns.show.motion import CROWDED, aligned_start, frustum_depth
 from kronc_ns.solution import Solution, ViewReport, ViewStatus
@@ -30,12 +28,12 @@ def cameras_3d(scene: Scene, solution: Solution) -> go.Figure | None:
     """Cameras before (moved onto the solved ones by the best similarity) and after, and keypoints; None if none."""
     traces: list[go.Scatter3d] = []
     after, before = solution.c2w, aligned_start(solution)
-    depth = frustum_depth(after if known(after).any() else before)
-    if known(before).any():
+    depth = frustum_depth(after if posed(after).any() else before)
+    if posed(before).any():
         start = f"before: {solution.init}"
-        traces.append(_outlines(before[known(before)], solution.camera, depth, name=start, meta="before", width=1))
+        traces.append(_outlines(before[posed(before)], solution.camera, depth, name=start, meta="before", width=1))
     for status in (ViewStatus.SOLVED, ViewStatus.COMPLETED):
-        chosen = _having(solution.views, status) & known(after)
+        chosen = solution.views_that_are(status) & posed(after)
         if not chosen.any():
             continue
         traces.append(_outlines(after[chosen], solution.camera, depth, name=status.value, meta=status.value))
@@ -55,9 +53,9 @@ def cameras_3d(scene: Scene, solution: Solution) -> go.Figure | None:
     traces += _car(scene, solution.points)
     if not traces:
         return None
-    places = torch.cat([after[..., 3], before[..., 3], solution.points])
-    places = places[places.isfinite().all(-1)]
-    low, high = (places.amin(0) - depth).tolist(), (places.amax(0) + depth).tolist()
+    places = np.concatenate([after[..., 3], before[..., 3], solution.points])
+    places = places[np.isfinite(places).all(-1)]
+    low, high = (places.min(0) - depth).tolist(), (places.max(0) + depth).tolist()
     size = [b - a for a, b in zip(low, high, strict=True)]
     figure = go.Figure(traces)
     figure.update_layout(
@@ -74,9 +72,9 @@ def cameras_3d(scene: Scene, solution: Solution) -> go.Figure | None:
     return figure
 
 
-def residual_histogram(error: Float[Tensor, "n j"], inlier: Bool[Tensor, "n j"]) -> go.Figure | None:
+def residual_histogram(error: Float[np.ndarray, "n j"], inlier: Bool[np.ndarray, "n j"]) -> go.Figure | None:
     """Reprojection errors of all detections in views with a pose, those off the axis in the last bar; None if none."""
-    known = ~error.isnan()
+    known = ~np.isnan(error)
     if not inlier.any():
         return None
     end = 1.5 * float(error[inlier].max())
@@ -84,7 +82,7 @@ def residual_histogram(error: Float[Tensor, "n j"], inlier: Bool[Tensor, "n j"])
     width = end / _BINS
     figure = go.Figure()
     for name, chosen, meta in (("explained", inlier, "solved"), ("not explained", known & ~inlier, "failed")):
-        values = error[chosen].numpy()
+        values = error[chosen]
         counts, _ = np.histogram(np.minimum(values, edges[-1]), edges)
         text = [f"{low:.2f} to {low + width:.2f} px: {count}" for low, count in zip(edges, counts, strict=False)]
         text[-1] = f"{edges[-2]:.2f} px and more: {counts[-1]}"
@@ -184,32 +182,28 @@ def _axis(values: Sequence[float]) -> dict:
     return {"type": "log", "tickvals": marks, "ticktext": [f"{mark:g}" for mark in marks]}
 
 
-def _having(views: Sequence[ViewReport], status: ViewStatus) -> Bool[Tensor, "n"]:
-    return torch.tensor([view.status is status for view in views])
-
-
 def _outlines(
-    c2w: Float[Tensor, "n 3 4"], camera: Camera, depth: float, name: str, meta: str, width: int = 2
+    c2w: Float[np.ndarray, "n 3 4"], camera: Camera, depth: float, name: str, meta: str, width: int = 2
 ) -> go.Scatter3d:
     """Cameras as pyramids over their image."""
     right, down = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
     corners = [[-right, -down, 1], [right, -down, 1], [right, down, 1], [-right, down, 1]]
-    pyramid = depth * torch.tensor([[0.0, 0.0, 0.0], *corners, [math.nan] * 3], dtype=c2w.dtype)
-    line = transform(c2w, pyramid[[*_OUTLINE]].expand(len(c2w), -1, -1)).reshape(-1, 3)
+    pyramid = depth * np.array([[0.0, 0.0, 0.0], *corners, [math.nan] * 3])
+    line = transform(c2w, np.broadcast_to(pyramid[[*_OUTLINE]], (len(c2w), len(_OUTLINE), 3))).reshape(-1, 3)
     return go.Scatter3d(
         **_xyz(line), mode="lines", line={"width": width}, name=name, meta=meta, legendgroup=meta, hoverinfo="skip"
     )
 
 
-def _car(scene: Scene, points: Float[Tensor, "j 3"]) -> list[go.Scatter3d]:
+def _car(scene: Scene, points: Float[np.ndarray, "j 3"]) -> list[go.Scatter3d]:
     """The solved keypoints, and lines between those that the schema joins."""
-    solved = points.isfinite().all(-1)
+    solved = np.isfinite(points).all(-1)
     edges = [edge for edge in scene.schema.skeleton if solved[list(edge)].all()]
     names = [name for name, known in zip(scene.schema.keypoints, solved.tolist(), strict=True) if known]
-    gap = torch.full((len(edges), 1, 3), math.nan, dtype=points.dtype)
+    gap = np.full((len(edges), 1, 3), math.nan)
     traces = []
     if edges:
-        lines = torch.cat([points[torch.tensor(edges)], gap], 1).reshape(-1, 3)
+        lines = np.concatenate([points[np.array(edges)], gap], axis=1).reshape(-1, 3)
         shared = {"meta": "points", "legendgroup": "points", "showlegend": False, "hoverinfo": "skip"}
         traces.append(go.Scatter3d(**_xyz(lines), mode="lines", line={"width": 2}, **shared))
     if names:
@@ -237,5 +231,5 @@ def _label(view: ViewReport) -> str:
     return "<br>".join(lines)
 
 
-def _xyz(points: Float[Tensor, "n 3"]) -> dict[str, np.ndarray]:
-    return dict(zip("xyz", points.numpy().astype(np.float32).T, strict=True))
+def _xyz(points: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
+    return dict(zip("xyz", points.astype(np.float32).T, strict=True))

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from PIL import Image
-from torch import Tensor
 
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import invert
@@ -75,9 +73,11 @@ def choose_views(solution: Solution) -> list[tuple[str, int]]:
     ]
 
 
-def overlay(kind: str, i: int, scene: Scene, solution: Solution, inlier: Bool[Tensor, "n j"], folder: Path) -> Overlay:
+def overlay(
+    kind: str, i: int, scene: Scene, solution: Solution, inlier: Bool[np.ndarray, "n j"], folder: Path
+) -> Overlay:
     """View ``i`` of a solution that lies in ``folder``."""
-    view, keypoints = solution.views[i], scene.keypoints[i].numpy()
+    view, keypoints = solution.views[i], scene.keypoints[i]
     projected = _projected(solution.points, solution.c2w[i], solution.camera)
     seen = keypoints[:, 2] > 0
     met = seen & np.isfinite(projected).all(1)
@@ -97,7 +97,7 @@ def overlay(kind: str, i: int, scene: Scene, solution: Solution, inlier: Bool[Te
     caption = f"{view.inliers} of {view.visible} keypoints explained"
     if view.rmse_px is not None:
         caption = f"RMSE {view.rmse_px:.2f} px, {caption}"
-    box = _around(np.concatenate([keypoints[seen, :2], projected[inlier[i].numpy()]]), scene.camera)
+    box = _around(np.concatenate([keypoints[seen, :2], projected[inlier[i]]]), scene.camera)
     return Overlay(
         kind, view.name, view.reason or caption, box, _picture(folder / scene.names[i], box, scene.camera), marks, lines
     )
@@ -121,17 +121,19 @@ def _around(uv: Float[np.ndarray, "m 2"], camera: Camera) -> Box:
     return (left, top, right, bottom)
 
 
-def _projected(points: Float[Tensor, "j 3"], c2w: Float[Tensor, "3 4"], camera: Camera) -> Float[np.ndarray, "j 2"]:
+def _projected(
+    points: Float[np.ndarray, "j 3"], c2w: Float[np.ndarray, "3 4"], camera: Camera
+) -> Float[np.ndarray, "j 2"]:
     """Pixels of the points in the image as taken, lens distortion included; NaN behind the camera or where unknown."""
+    import cv2
+
     pixels = np.full((len(points), 2), np.nan)
     w2c = invert(c2w)
     z = points @ w2c[2, :3] + w2c[2, 3]
-    front = (z > 0).numpy()
+    front = z > 0
     if front.any():
-        rotation, _ = cv2.Rodrigues(w2c[:, :3].numpy())
-        found, _ = cv2.projectPoints(
-            points.numpy()[front], rotation, w2c[:, 3].numpy(), camera.matrix, np.array(camera.distortion)
-        )
+        rotation, _ = cv2.Rodrigues(w2c[:, :3])
+        found, _ = cv2.projectPoints(points[front], rotation, w2c[:, 3], camera.matrix, np.array(camera.distortion))
         pixels[front] = found[:, 0]
     return pixels
 

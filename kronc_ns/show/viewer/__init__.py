@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from kronc_ns.errors import KroncError
 from kronc_ns.files.record import read_solution
-from kronc_ns.geometry.poses import known
+from kronc_ns.geometry.poses import posed
 from kronc_ns.show.viewer.panel import Viewer
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def open_viewer(folder: Path, port: int) -> Viewer:
     Raises `KroncError` where the folder is not solved or has no pose, the port is taken or viser is not installed.
     """
     scene, solution = read_solution(folder)
-    if not known(solution.c2w).any():
+    if not posed(solution.c2w).any():
         raise KroncError(f"{folder}: no view has a pose, so there is nothing to see: `kronc report` says why")
     _check_port(port)
     return Viewer(_serve(port), scene, solution, folder)

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from torch import Tensor
 
 from kronc_ns.geometry.camera import Camera
-from kronc_ns.geometry.poses import known
+from kronc_ns.geometry.poses import posed
 from kronc_ns.geometry.rotations import quaternion_from_rotation
 from kronc_ns.show.motion import frustum_depth
 from kronc_ns.show.viewer.colours import SELECTED, Colour
@@ -26,7 +25,7 @@ class Cameras:
         self,
         server: "viser.ViserServer",
         camera: Camera,
-        c2w: Float[Tensor, "n 3 4"],
+        c2w: Float[np.ndarray, "n 3 4"],
         colours: UInt8[np.ndarray, "n 3"],
         on_click: Callable[[int], None],
     ) -> None:
@@ -45,17 +44,17 @@ class Cameras:
     @property
     def views(self) -> list[int]:
         """Indices of the views that have a pose."""
-        return known(self._c2w).nonzero()[:, 0].tolist()
+        return np.flatnonzero(posed(self._c2w)).tolist()
 
     def pose(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Quaternion (w, x, y, z) and centre of view ``i`` as it is shown."""
-        return quaternion_from_rotation(self._c2w[i, :, :3]).numpy(), self._c2w[i, :, 3].numpy()
+        return quaternion_from_rotation(self._c2w[i, :, :3]), self._c2w[i, :, 3]
 
-    def move(self, c2w: Float[Tensor, "n 3 4"]) -> None:
+    def move(self, c2w: Float[np.ndarray, "n 3 4"]) -> None:
         """Show other poses."""
         with self._lock:
             self._c2w = c2w
-            turns, centres = quaternion_from_rotation(c2w[..., :3]).numpy(), c2w[..., 3].numpy()
+            turns, centres = quaternion_from_rotation(c2w[..., :3]), c2w[..., 3]
             for i, handle in self._handles.items():
                 handle.wxyz, handle.position = turns[i], centres[i]
 

@@ -4,8 +4,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from jaxtyping import Bool, Float, UInt32
 
 from kronc_ns.geometry.camera import rays
 from kronc_ns.scene import Scene
@@ -24,16 +23,13 @@ class Car:
     """Keypoints, skeleton and the rays of one view."""
 
     def __init__(
-        self, server: "viser.ViserServer", scene: Scene, solution: Solution, inlier: Bool[Tensor, "n j"]
+        self, server: "viser.ViserServer", scene: Scene, solution: Solution, inlier: Bool[np.ndarray, "n j"]
     ) -> None:
         self._server, self._scene, self._solution, self._inlier = server, scene, solution, inlier
         points = solution.points
-        self._points = points.numpy()
-        self._known = points.isfinite().all(-1).nonzero()[:, 0].tolist()
-        low, high = (
-            (points[self._known].amin(0), points[self._known].amax(0)) if self._known else (points[0], points[0])
-        )
-        self._size = float((high - low).max()) if self._known else 1.0
+        self._points = points
+        self._known = np.flatnonzero(np.isfinite(points).all(-1)).tolist()
+        self._size = float(np.ptp(points[self._known], axis=0).max()) if self._known else 1.0
         self._names: dict[int, viser.LabelHandle] = {}
         self._rays: list[viser.MeshHandle] = []
         self._draw()
@@ -59,13 +55,13 @@ class Car:
         """Rays from a camera through its detections, as far as the solved points are."""
         self.hide_rays()
         ends = rays(self._scene.uv[i], self._scene.camera) * self._solution.depths[i][:, None]
-        met = ends.isfinite().all(-1)
+        met = np.isfinite(ends).all(-1)
         for name, chosen, colour in (
             ("explained", met & self._inlier[i], SELECTED),
             ("not explained", met & ~self._inlier[i], ODD),
         ):
             if chosen.any():
-                to = ends[chosen].numpy()
+                to = ends[chosen]
                 self._rays.append(
                     self._tubes(f"/rays/{name}", np.zeros_like(to), to, _RAY, colour, wxyz=wxyz, position=position)
                 )
@@ -113,7 +109,7 @@ class Car:
 
 def tubes(
     starts: Float[np.ndarray, "m 3"], ends: Float[np.ndarray, "m 3"], radius: float
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+) -> tuple[Float[np.ndarray, "v 3"], UInt32[np.ndarray, "f 3"]]:
     """Vertices and triangles of three-sided tubes along m lines: viser 0.2 has no thick lines in a single node."""
     along = ends - starts
     along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)

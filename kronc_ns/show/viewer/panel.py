@@ -151,7 +151,7 @@ class Viewer:
 
     def _draw_ground(self) -> None:
         points = self._solution.points
-        low = points[points.isfinite().all(-1)][:, 2]
+        low = points[np.isfinite(points).all(-1)][:, 2]
         self.server.scene.add_grid(
             "/ground", width=20.0, height=20.0, plane="xy", cell_size=1.0, section_size=5.0, cell_color=_GRID,
             section_color=_GRID, position=(0.0, 0.0, float(low.min()) if len(low) else 0.0),
@@ -176,7 +176,7 @@ class Viewer:
 
     def _look_at_all(self, client: "viser.ClientHandle") -> None:
         """Set a new reader where all cameras are in sight."""
-        centres = self._solution.c2w[self.cameras.views, :, 3].numpy()
+        centres = self._solution.c2w[self.cameras.views, :, 3]
         middle = self.car.centre
         reach = float(np.linalg.norm(centres - middle, axis=1).max())
         client.camera.position = middle + reach * 1.15 * _FROM

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import plotly.graph_objects as go
 import pytest
-import torch
 
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import claim_output
@@ -32,7 +31,7 @@ EMPTY = 4  # a view without keypoints
 @pytest.fixture(scope="module")
 def solved_lap(lap):
     """A walk with a view without keypoints, solved."""
-    keypoints = lap.keypoints.clone()
+    keypoints = lap.keypoints.copy()
     keypoints[EMPTY, :, 2] = 0
     scene = scene_of(replace(lap, keypoints=keypoints))
     return scene, solve_scene(scene, KroncConfig())
@@ -142,10 +141,10 @@ def test_a_failed_solution_is_reported_with_its_reason(tmp_path, solved_lap, sta
     scene, solution = solved_lap
     views = tuple(replace(v, status=ViewStatus.FAILED, rmse_px=None, reason="lost it") for v in solution.views)
     views = tuple(replace(view, sigma_rot_deg=None, sigma_trans_m=None) for view in views)
-    lost = torch.full_like(solution.c2w, math.nan)
+    lost = np.full_like(solution.c2w, math.nan)
     nothing = replace(
         solution, status=status, reason="nothing fits", views=views, c2w=lost, initial_c2w=lost, rmse_px=math.nan,
-        points=torch.full_like(solution.points, math.nan), median_px=math.nan, history={},
+        points=np.full_like(solution.points, math.nan), median_px=math.nan, history={},
     )  # fmt: skip
     folder = written(tmp_path, scene, nothing)
     assert plots(folder) == {}
@@ -202,8 +201,8 @@ def test_overlays_show_images_where_the_points_are_in_them(tmp_path, walk_folder
     view = solution.c2w[2]
     body = transform(invert(view), solution.points)
     ideal = body[:, :2] / body[:, 2:]
-    bent = ideal * (1 + camera.k1 * ideal.square().sum(1, keepdim=True))
-    expected = bent * torch.tensor([camera.fx, camera.fy]) + torch.tensor([camera.cx, camera.cy])
+    bent = ideal * (1 + camera.k1 * np.square(ideal).sum(1, keepdims=True))
+    expected = bent * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     image = np.full((camera.height, camera.width, 3), 60, np.uint8)
     (walk_folder / "images").mkdir(exist_ok=True)
     cv2.imwrite(str(walk_folder / scene.names[2]), image)
@@ -222,10 +221,10 @@ def test_overlays_show_images_where_the_points_are_in_them(tmp_path, walk_folder
 
 def test_before_and_after_coincide_where_the_start_differs_by_a_similarity_only(solved_lap):
     scene, solution = solved_lap
-    rotation = so3_exp(torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64))
-    moved = solution.c2w.clone()
+    rotation = so3_exp(np.array([0.3, -0.2, 1.0]))
+    moved = solution.c2w.copy()
     moved[..., :3] = rotation @ moved[..., :3]
-    moved[..., 3] = 2.5 * moved[..., 3] @ rotation.T + torch.tensor([1.0, 2.0, 3.0])
+    moved[..., 3] = 2.5 * moved[..., 3] @ rotation.T + (1.0, 2.0, 3.0)
     figure = figures.cameras_3d(scene, replace(solution, initial_c2w=moved))
     before = next(trace for trace in figure.data if trace.meta == "before")
     centres = np.stack([before.x, before.y, before.z], 1)[5::12]  # of a camera's twelve vertices the sixth

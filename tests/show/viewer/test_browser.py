@@ -9,14 +9,13 @@ from urllib.parse import unquote
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from kronc_ns.files.record import read_solution
 from kronc_ns.geometry.rotations import quaternion_from_rotation
 from kronc_ns.show.motion import aligned_start, frustum_depth
 from kronc_ns.show.viewer import open_viewer
 from tests.conftest import BROWSER_PATIENCE_MS
-from tests.viewer.test_viewer import free_port
+from tests.show.viewer.test_viewer import free_port
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'kronc-ns[viewer]'")
 pytestmark = pytest.mark.slow
@@ -132,10 +131,10 @@ def test_the_slider_moves_the_cameras(page, viewer, solved_lap_folder):
     """To their start, to their end, and to the start again."""
     _, solution = read_solution(solved_lap_folder)
     start = aligned_start(solution)
-    moving = [i for i in viewer.cameras.views if start[i].isfinite().all()]
+    moving = [i for i in viewer.cameras.views if np.isfinite(start[i]).all()]
     slider = page.get_by_role("slider").first
 
-    def seen_at(key: str, c2w: torch.Tensor) -> tuple[int, np.ndarray]:
+    def seen_at(key: str, c2w: np.ndarray) -> tuple[int, np.ndarray]:
         slider.press(key)
         until(page, lambda: np.allclose(viewer.cameras.pose(moving[0])[1], c2w[moving[0], :, 3]))
         for i in moving:
@@ -161,9 +160,9 @@ def test_a_click_on_a_camera_selects_it(page, viewer, solved_lap_folder):
     (client,) = viewer.server.get_clients().values()
     canvas = page.locator(SCENE).bounding_box()
     ahead = frustum_depth(solution.c2w) * solution.c2w[..., 2]
-    at = {i: on_canvas(page, client, (solution.c2w[i, :, 3] + ahead[i]).numpy()) for i in viewer.cameras.views}
+    at = {i: on_canvas(page, client, solution.c2w[i, :, 3] + ahead[i]) for i in viewer.cameras.views}
     inside = [i for i, (x, y) in at.items() if 30 < x < canvas["width"] - 30 and 30 < y < canvas["height"] - 30]
-    distance = (solution.c2w[..., 3] - torch.from_numpy(client.camera.position)).norm(dim=-1)
+    distance = np.linalg.norm(solution.c2w[..., 3] - client.camera.position, axis=-1)
     i = min((i for i in inside if i != viewer.selected), key=lambda i: float(distance[i]))
     x, y = at[i]
     page.mouse.move(x, y)
