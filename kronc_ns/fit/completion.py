@@ -74,7 +74,7 @@ def _aimed(
         points_known=True,
     )
     start = State.of(walk.c2w[some], np.where(np.isfinite(evidence.points), evidence.points, 0.0))
-    found = adjust(problem, start, LmConfig(loss="huber"), most_sigma_px=max(verdict.rmse_px, _NOISE_PX)).state.c2w
+    found = adjust(problem, start, LmConfig(loss="huber"), sigma_px=max(verdict.rmse_px, _NOISE_PX)).state.c2w
     turned = rotation_angle_deg(found[..., :3].swapaxes(1, 2) @ walk.c2w[some][..., :3])
     believed = turned <= _BELIEVED_SIGMAS * walk.sigma_rot_deg[some]
     c2w = walk.c2w.copy()

@@ -27,8 +27,8 @@ from kronc_ns.files.scene_folder import load_scene
 from kronc_ns.files.transforms import check_file_names
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import flip_camera_axes
+from kronc_ns.plugin.background import cut_out
 from kronc_ns.plugin.checks import check_masks, check_not_negative, check_positive
-from kronc_ns.plugin.images import cut_out
 from kronc_ns.plugin.seeds import Seeds, box_seeds, grey, ground_seeds
 from kronc_ns.plugin.views import SolvedViews, image_level, solved_views, test_views
 from kronc_ns.plugin.visual_hull import carve, read_pictures

@@ -42,12 +42,12 @@ def adjust(
     start: State,
     config: LmConfig | None = None,
     progress: Callable[[int, float], None] | None = None,
-    most_sigma_px: float = math.inf,
+    sigma_px: float | None = None,
 ) -> LmResult:
     """Minimise from ``start``. ``progress(step, loss)`` is optional.
 
-    ``most_sigma_px`` is for a start that is nearly right among many outliers: noise that residuals far above it do
-    not make believe otherwise.
+    ``sigma_px`` is the noise where it is known: for a start that is nearly right among many outliers, or so few
+    detections that they can be met exactly, the residuals do not tell it.
     """
     config = config or LmConfig()
     data, redundancy = schur.measured(problem), problem.redundancy
@@ -57,7 +57,11 @@ def adjust(
 
     schur.evaluate(data, now)
     phase = robust.first_phase(config.loss)
-    sigma = min(robust.noise(now.length, work.order) * redundancy, most_sigma_px)
+
+    def noise() -> float:
+        return robust.noise(now.length, work.order) * redundancy if sigma_px is None else sigma_px
+
+    sigma = noise()
     cost = schur.total_cost(data, now, sigma, phase)
     damping, rounds, done = START_DAMPING, 0, False
     losses: list[float] = []
@@ -74,12 +78,13 @@ def adjust(
         damping = min(damping, MOST_DAMPING)
         if settled or phase != robust.TRIMMED:
             # follow the residuals with the scale of the loss
-            shrunk = min(sigma, robust.noise(now.length, work.order) * redundancy)
+            shrunk = min(sigma, noise())
             if phase != robust.TRIMMED:
                 sigma = shrunk
             if settled:
                 rounds += 1
-                phase, sigma, done = robust.next_phase(now.length, sigma, phase, shrunk, redundancy)
+                phase, told, done = robust.next_phase(now.length, sigma, phase, shrunk, redundancy)
+                sigma = told if sigma_px is None else sigma_px
                 done = done or rounds >= robust.ROUNDS
             cost = schur.total_cost(data, now, sigma, phase)
         losses.append(math.sqrt(cost / detections))

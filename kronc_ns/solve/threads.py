@@ -14,13 +14,8 @@ _local = threading.local()
 
 def side_by_side(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
     """``map`` on all cores, in the items' order; within it parts are run one after the other."""
-
-    def alone(item: _Item) -> _Result:
-        _local.alone = True
-        return function(item)
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        yield from pool.map(alone, items)
+    with ThreadPoolExecutor(os.cpu_count(), initializer=_stay_alone) as pool:
+        yield from pool.map(function, items)
 
 
 def in_parts(run: Callable[[int], None], parts: int) -> None:
@@ -38,7 +33,12 @@ def in_parts(run: Callable[[int], None], parts: int) -> None:
 @lru_cache(maxsize=1)
 def _helpers() -> ThreadPoolExecutor:
     """Threads that wait for parts; made when first needed, since a start takes as long as a part."""
-    return ThreadPoolExecutor((os.cpu_count() or 2) - 1, thread_name_prefix="kronc-part")
+    return ThreadPoolExecutor((os.cpu_count() or 2) - 1, "kronc-part", _stay_alone)
+
+
+def _stay_alone() -> None:
+    """What runs in this thread is not split further: parts that wait for parts would leave nobody to run them."""
+    _local.alone = True
 
 
 if hasattr(os, "register_at_fork"):  # a child process has none of its parent's threads

@@ -18,8 +18,8 @@ from kronc_ns.files.record import write_solution
 from kronc_ns.files.scene_folder import load_scene
 from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.geometry.poses import flip_camera_axes
+from kronc_ns.plugin.background import cut_out
 from kronc_ns.plugin.dataparser import KroncDataParser, KroncDataParserConfig
-from kronc_ns.plugin.images import cut_out
 from kronc_ns.solution import Solution, ViewStatus
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import default_camera, make_capture

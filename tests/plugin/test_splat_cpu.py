@@ -49,6 +49,15 @@ def random_scene(count: int, cameras: int = 1, size: float = -2.5, bands: int | 
     return tensors, (viewmats, intrinsics, WIDTH, HEIGHT)
 
 
+@pytest.fixture
+def two_threads():
+    """Between which the tiles are shared out."""
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(1)
+
+
+@pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize(
     ("count", "size", "bands", "cameras", "options"),
     [

@@ -342,13 +342,13 @@ def test_expectations_of_nothing_change_nothing():
     np.testing.assert_array_equal(ours.state.points, theirs.state.points)
 
 
-def test_noise_of_a_start_nearly_right_is_not_believed_beyond_what_is_asked():
+def test_noise_that_is_known_is_not_told_from_the_residuals():
     """Few right detections among many wrong ones: the median residual would make all of them inliers."""
     problem, truth = scene(views=10, joints=30, noise_px=0.5, outliers=0.55, seen=1.0)
     problem = replace(problem, points_known=True)
     start = replace(started(truth, 0.5, 0.02), points=truth.points)
-    believing, doubting = adjust(problem, start), adjust(problem, start, most_sigma_px=1.0)
-    assert doubting.sigma_px <= 1.0
+    believing, doubting = adjust(problem, start), adjust(problem, start, sigma_px=1.0)
+    assert doubting.sigma_px == 1.0
     assert errors(doubting.state, truth)[0].mean() <= errors(believing.state, truth)[0].mean()
     wild = lengths(problem, truth) > 15
     assert (doubting.inlier & wild).sum() < 0.02 * wild.sum()

@@ -20,7 +20,8 @@ def four_cores(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
     threads._helpers.cache_clear()
     yield
-    threads._helpers().shutdown()
+    if threads._helpers.cache_info().currsize:
+        threads._helpers().shutdown()
     threads._helpers.cache_clear()
 
 

@@ -238,4 +238,4 @@ def test_the_histogram_counts_every_detection_once(solved_lap):
     assert isinstance(figure, go.Figure)
     explained, not_explained = (int(np.sum(trace.y)) for trace in figure.data)
     assert explained == int(inlier.sum())
-    assert explained + not_explained == int((~error.isnan()).sum())
+    assert explained + not_explained == int((~np.isnan(error)).sum())

@@ -1,4 +1,4 @@
-"""Images cut out of their background."""
+"""Vehicles cut out of their background."""
 
 import hashlib
 from collections.abc import Sequence
