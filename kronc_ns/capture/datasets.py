@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from PIL import Image
-from torch import Tensor
 
 from kronc_ns.capture.images import copy_upright, upright_size
 from kronc_ns.capture.source import IMAGE_SUFFIXES, list_images
@@ -44,7 +42,7 @@ class Views:
     names: tuple[str, ...]
     """What keypoint files call them."""
     camera: Camera
-    c2w: Float[Tensor, "n 3 4"]
+    c2w: Float[np.ndarray, "n 3 4"]
     """Trusted poses, OpenCV axes; NaN where a view has none."""
     schema: KeypointSchema
     keypoints: Float[np.ndarray, "n j 3"]
@@ -96,7 +94,7 @@ def _carpatch_split(data: Path, split: str) -> Views:
     camera = Camera(focal, focal, width / 2, height / 2, width, height)
     candidates = [data / f"keypoints_{split}.json", data / split / "keypoints.json", data / split]
     schema, keypoints = _keypoints(candidates, names, camera)
-    return Views(images, names, camera, torch.stack(list(poses.values())), schema, keypoints, None)
+    return Views(images, names, camera, np.stack(list(poses.values())), schema, keypoints, None)
 
 
 def _posed_by_colmap(data: Path) -> Views:
@@ -118,8 +116,8 @@ def _posed_by_colmap(data: Path) -> Views:
             f"{images[0]} is {'x'.join(map(str, _size(images)))}, COLMAP's camera {camera.width}x{camera.height}: "
             "expected the images that COLMAP was given"
         )
-    none = torch.full((3, 4), torch.nan, dtype=torch.float64)
-    c2w = torch.stack([poses.get(name, none) for name in names])
+    none = np.full((3, 4), np.nan)
+    c2w = np.stack([poses.get(name, none) for name in names])
     schema, keypoints = _keypoints([data / "keypoints.json", data / "keypoints", images[0].parent], names, camera)
     masks = _masks(data / "masks", names) if (data / "masks").is_dir() else None
     return Views(images, names, camera, c2w, schema, keypoints, masks)
@@ -139,7 +137,7 @@ def _masks(folder: Path, names: tuple[str, ...]) -> tuple[Path, ...]:
     return tuple(file for file in found if file is not None)
 
 
-def _read_colmap(data: Path) -> tuple[Camera, dict[str, Float[Tensor, "3 4"]]]:
+def _read_colmap(data: Path) -> tuple[Camera, dict[str, Float[np.ndarray, "3 4"]]]:
     """The one camera of a COLMAP model and the poses (OpenCV c2w) of its registered images, by file name."""
     import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
 
@@ -164,7 +162,7 @@ def _read_colmap(data: Path) -> tuple[Camera, dict[str, Float[Tensor, "3 4"]]]:
     if focal is not None:
         values |= {"fx": focal, "fy": focal}
     poses = {
-        PurePosixPath(image.name).name: torch.from_numpy(image.cam_from_world().inverse().matrix())
+        PurePosixPath(image.name).name: np.asarray(image.cam_from_world().inverse().matrix())
         for image in model.images.values()
         if image.has_pose
     }
@@ -213,7 +211,7 @@ def _joined(parts: Sequence[Views]) -> Views:
         tuple(image for part in parts for image in part.images),
         tuple(name for part in parts for name in part.names),
         first.camera,
-        torch.cat([part.c2w for part in parts]),
+        np.concatenate([part.c2w for part in parts]),
         first.schema,
         np.concatenate([part.keypoints for part in parts]),
         None,

@@ -4,11 +4,9 @@ import hashlib
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 
 from kronc_ns.capture.detection.model import file_sha256
@@ -27,6 +25,7 @@ _PATCH = 14  # px of DINOv2's patches, of which the input holds a whole number
 _LONG_SIDE = 56 * _PATCH
 
 
+@runtime_checkable
 class DepthEstimator(Protocol):
     """A monocular depth network that is ready to run."""
 
@@ -53,16 +52,19 @@ class DinoDepth:
         """Model, its revision or content, and resolution."""
         return f"depth {self._network.name} {_LONG_SIDE}"
 
-    @torch.inference_mode()
     def estimate(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w2"]:
         """The network's depth at its own resolution."""
+        import cv2
+        import torch
+
         factor = _LONG_SIDE / max(rgb.shape[:2])
         height, width = (max(1, round(side * factor / _PATCH)) * _PATCH for side in rgb.shape[:2])
         whole = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
         # the processor's own padding would have to be cut off again
         network = self._network
         inputs = network.processor(images=whole, do_resize=False, do_pad=False, return_tensors="pt").to(network.device)
-        return network.model(**inputs).predicted_depth[0].float().cpu().numpy()
+        with torch.inference_mode():
+            return network.model(**inputs).predicted_depth[0].float().cpu().numpy()
 
 
 def depth_estimator(config: KroncConfig, weights: Path | None) -> DepthEstimator | None:
@@ -93,14 +95,14 @@ def estimate_depths(estimator: DepthEstimator, scene: Scene, folder: Path, progr
     Maps are kept by image content, so that an interrupted run goes on where it stopped.
     """
     depths = np.full(scene.keypoints.shape[:2], np.nan)
-    for number, (name, rows) in enumerate(zip(scene.names, scene.keypoints.numpy(), strict=True)):
+    for number, (name, rows) in enumerate(zip(scene.names, scene.keypoints, strict=True)):
         if (rows[:, 2] > 0).any():
             depths[number] = depth_under(rows, _map_of(estimator, folder / name), scene.camera)
         if progress is not None:
             progress(number + 1, len(scene), None)
     if not np.isfinite(depths).any():
         raise KroncError(f"no depth was estimated under any keypoint ({estimator.identity}): use --depth-init random")
-    return replace(scene, given_depths=torch.from_numpy(depths))
+    return replace(scene, given_depths=depths)
 
 
 @lru_cache(maxsize=1)

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from kronc_ns.capture.detection.model import file_sha256
 from kronc_ns.errors import KroncError
 
@@ -20,7 +18,8 @@ class Pretrained:
     processor: Any
     """Makes its inputs of images."""
     model: Any
-    device: torch.device
+    device: str
+    """What torch calls it: cuda or cpu."""
     name: str
     """Changes with the weights: it holds a digest of their files."""
 
@@ -41,6 +40,7 @@ def load_pretrained(model_class: Any, weights: Path | None, default: str, option
 
     Raises `KroncError` that says what to give as ``option`` where they cannot be loaded.
     """
+    import torch
     from huggingface_hub.errors import HfHubHTTPError
     from transformers import AutoImageProcessor
 
@@ -55,7 +55,7 @@ def load_pretrained(model_class: Any, weights: Path | None, default: str, option
             f"{weights or default} cannot be loaded ({str(error).strip().splitlines()[0]}): give as {option} a folder "
             f"with what `hf download {default} --local-dir FOLDER` fetches"
         ) from None
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
     files = sorted(path for path in folder.iterdir() if path.suffix in _WEIGHTS)
     name = " ".join([str(weights or default), *map(file_sha256, files)])
     return Pretrained(processor, model.eval().to(device), device, name)

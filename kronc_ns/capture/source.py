@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-import torch
+import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
 from kronc_ns.capture.images import HEIF_SUFFIXES, read_heif
 from kronc_ns.errors import KroncError
@@ -39,7 +38,7 @@ class Source:
     """What keypoint files may call the images."""
     camera: Camera | None = None
     """Intrinsics of transforms.json."""
-    c2w: Float[Tensor, "n 3 4"] | None = None
+    c2w: Float[np.ndarray, "n 3 4"] | None = None
     """Poses of transforms.json (OpenCV axes), where every frame has one."""
     masks: Path | tuple[Path, ...] | None = None
     """Mask of each image as transforms.json says, or a folder ``masks`` beside the images."""
@@ -125,7 +124,7 @@ def _scene(data: Path) -> Source:
         images,
         names,
         camera=camera,
-        c2w=torch.stack([poses[name] for name in names]) if posed else None,
+        c2w=np.stack([poses[name] for name in names]) if posed else None,
         masks=masks or (data / "masks" if (data / "masks").is_dir() else None),
         depths=_listed(data, frames, "depth_file_path"),
         keypoints=_own_keypoints(data, images[0].parent),

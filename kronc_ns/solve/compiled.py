@@ -46,18 +46,40 @@ def is_compiled(function: Any) -> bool:
 class _StampedCache(FunctionCache):
     """Numba's cache on disk, fresh as long as no compiled function of ours changes, wherever it stands.
 
-    Numba's own notices changes of the function's file only, not of what it calls.
+    Numba's own notices changes of the function's file only, not of what it calls, and raises where files are garbage or
+    cannot be written.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         self._cache_file._source_stamp = (self._cache_file._source_stamp, _sources())
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # garbage raises anything as it is unpickled
+            self._clear()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        if not self.holds_something():
+            self._clear()  # the index is written first: were that all, it would pass old code off as new
+        try:
+            super().save_overload(sig, data)
+        except Exception:  # a full disk, for one
+            self._clear()
+
     def holds_something(self) -> bool:
         try:
             return bool(self._cache_file._load_index())
-        except OSError:
+        except Exception:
             return False
+
+    def _clear(self) -> None:
+        for file in Path(self.cache_path).glob(f"{self._impl.filename_base}.*"):
+            if file.suffix in (".nbi", ".nbc"):
+                with contextlib.suppress(OSError):
+                    file.unlink()
 
 
 @lru_cache(maxsize=1)

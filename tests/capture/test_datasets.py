@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from kronc_ns.capture.datasets import import_dataset
 from kronc_ns.errors import KroncError
@@ -33,8 +32,8 @@ def capture() -> Capture:
 def carpatch(capture, tmp_path) -> Path:
     """The capture as CarPatch has it: two splits, RGBA images, Blender's field of view."""
     folder = tmp_path / "carpatch"
-    matrices = torch.cat([flip_camera_axes(capture.c2w), torch.tensor([[[0.0, 0, 0, 1]]]).expand(VIEWS, 1, 4)], 1)
-    rows = capture.keypoints.numpy()
+    matrices = flip_camera_axes(capture.c2w)
+    rows = capture.keypoints
     for split, first, count in (("train", 0, TRAIN), ("test", TRAIN, VIEWS - TRAIN)):
         (folder / split).mkdir(parents=True)
         frames, keypoints = [], {}
@@ -71,7 +70,7 @@ def video(capture, tmp_path) -> Path:
         mask = np.where(np.arange(64) < 10 + i, 255, 0).astype(np.uint8) * np.ones((64, 1), np.uint8)
         cv2.imwrite(str(folder / "masks" / f"{name}.png"), mask)
     write_keypoints(
-        folder / "keypoints.json", APOLLOCAR3D_66, (64, 64), dict(zip(names, capture.keypoints.numpy(), strict=True))
+        folder / "keypoints.json", APOLLOCAR3D_66, (64, 64), dict(zip(names, capture.keypoints, strict=True))
     )
     return folder
 
@@ -91,8 +90,8 @@ def test_carpatch_comes_back_exactly(capture, carpatch, tmp_path):
     assert scene.names[TRAIN] == "images/test_r_0.png"
     assert all((out / name).is_file() for name in scene.names)
     poses = read_poses(out / "reference.json")
-    torch.testing.assert_close(torch.stack([poses[n] for n in scene.names]), capture.c2w, atol=1e-12, rtol=0)
-    torch.testing.assert_close(scene.keypoints, capture.keypoints, atol=5e-4, rtol=0)
+    np.testing.assert_allclose(np.stack([poses[n] for n in scene.names]), capture.c2w, atol=1e-12, rtol=0)
+    np.testing.assert_allclose(scene.keypoints, capture.keypoints, atol=5e-4, rtol=0)
     assert scene.camera.fx == pytest.approx(capture.camera.fx, rel=1e-12)
     assert (scene.camera.cx, scene.camera.width) == (32.0, 64)
     check_masks(out, scene.masks)
@@ -101,7 +100,7 @@ def test_carpatch_comes_back_exactly(capture, carpatch, tmp_path):
 def test_a_single_split_and_keypoints_in_its_folder(capture, carpatch, tmp_path):
     (carpatch / "keypoints_train.json").rename(carpatch / "train" / "keypoints.json")
     assert import_dataset(carpatch, tmp_path / "out", ("train",)) == TRAIN
-    torch.testing.assert_close(load_scene(tmp_path / "out").keypoints, capture.keypoints[:TRAIN], atol=5e-4, rtol=0)
+    np.testing.assert_allclose(load_scene(tmp_path / "out").keypoints, capture.keypoints[:TRAIN], atol=5e-4, rtol=0)
 
 
 def test_a_video_posed_by_colmap_comes_back_exactly(capture, video, tmp_path):
@@ -112,9 +111,9 @@ def test_a_video_posed_by_colmap_comes_back_exactly(capture, video, tmp_path):
     poses = read_poses(out / "reference.json")
     known = [i for i in range(VIEWS) if i != 2]
     assert set(poses) == {scene.names[i] for i in known}
-    found = torch.stack([poses[scene.names[i]] for i in known])
-    torch.testing.assert_close(found, capture.c2w[known], atol=1e-12, rtol=0)
-    torch.testing.assert_close(scene.keypoints, capture.keypoints, atol=5e-4, rtol=0)
+    found = np.stack([poses[scene.names[i]] for i in known])
+    np.testing.assert_allclose(found, capture.c2w[known], atol=1e-12, rtol=0)
+    np.testing.assert_allclose(scene.keypoints, capture.keypoints, atol=5e-4, rtol=0)
     assert (scene.camera.k1, scene.camera.k2, scene.camera.p1, scene.camera.p2) == (0.05, 0.0, 0.0, 0.01)
     check_masks(out, scene.masks)
 

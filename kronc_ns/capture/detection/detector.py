@@ -3,7 +3,7 @@
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -33,6 +33,7 @@ class CarDetection:
     """Confidence that this is a car, 0 to 1."""
 
 
+@runtime_checkable
 class Detector(Protocol):
     """A keypoint detector that is ready to run: what it needs was found when it was made."""
 

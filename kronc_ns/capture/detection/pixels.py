@@ -6,7 +6,6 @@ All places here are in our pixels (corner of the image at (0, 0), centre of its 
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
@@ -93,6 +92,8 @@ def crop(
 
     What lies outside the image is black.
     """
+    import cv2
+
     centre, sides = (box[:2] + box[2:]) / 2, np.maximum(box[2:] - box[:2], 1.0)
     factor = float((np.array(size) / sides).min() / padding)
     offset = np.array(size) / 2 - factor * centre
@@ -114,6 +115,8 @@ def normalise(rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "1 3 h w"]:
 
 
 def _resize(rgb: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> tuple[UInt8[np.ndarray, "h2 w2 3"], Placement]:
+    import cv2
+
     height, width = rgb.shape[:2]
     scale = (size[0] / width, size[1] / height)
     if size == (width, height):

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
@@ -114,6 +113,8 @@ def _read(file: Path) -> UInt8[np.ndarray, "h w"]:
 
 def _boxes(labels: UInt8[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "m 4"], tuple[int, int]]:
     """Centre and sides of each label in image diagonals, and the size of the map."""
+    import cv2
+
     rows = [cv2.boundingRect((labels == label).astype(np.uint8)) for label in range(1, int(labels.max()) + 1)]
     corners = np.array(rows, dtype=np.float64).reshape(-1, 4)
     boxes = np.concatenate([corners[:, :2] + corners[:, 2:] / 2, corners[:, 2:]], axis=1)
@@ -123,5 +124,7 @@ def _boxes(labels: UInt8[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "m 4"], 
 
 def _mask(labels: UInt8[np.ndarray, "h w"], label: int, size: tuple[int, int]) -> UInt8[np.ndarray, "h2 w2"]:
     """255 on the label's pixels (0: nowhere), in the size of the image, with smooth outlines."""
+    import cv2
+
     on_car = ((labels == label) & (label > 0)).astype(np.float32)
     return np.where(cv2.resize(on_car, size, interpolation=cv2.INTER_LINEAR) > 0.5, 255, 0).astype(np.uint8)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from kronc_ns.capture.pretrained import load_pretrained, transformers_for
@@ -32,14 +31,16 @@ class Mask2FormerSegmenter:
         """Model, its revision or content, and threshold."""
         return f"mask2former {self._network.name} {_MIN_SCORE}"
 
-    @torch.inference_mode()
     def segment(self, rgb: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
         """The cars, the surest first."""
+        import torch
+
         network = self._network
         inputs = network.processor(images=rgb, return_tensors="pt").to(network.device)
-        (found,) = network.processor.post_process_instance_segmentation(
-            network.model(**inputs), threshold=_MIN_SCORE, target_sizes=[rgb.shape[:2]]
-        )
+        with torch.inference_mode():
+            (found,) = network.processor.post_process_instance_segmentation(
+                network.model(**inputs), threshold=_MIN_SCORE, target_sizes=[rgb.shape[:2]]
+            )
         numbers = found["segmentation"].cpu().numpy()
         cars = [segment for segment in found["segments_info"] if segment["label_id"] in self._vehicles]
         cars.sort(key=lambda segment: segment["score"], reverse=True)

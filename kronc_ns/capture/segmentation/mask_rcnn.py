@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from kronc_ns.capture.detection.model import file_sha256
@@ -20,6 +19,7 @@ class MaskRcnnSegmenter:
     """All cars in an image."""
 
     def __init__(self, weights: Path | None) -> None:
+        import torch
         from torchvision.models.detection import MaskRCNN_ResNet50_FPN_V2_Weights, maskrcnn_resnet50_fpn_v2
 
         published = MaskRCNN_ResNet50_FPN_V2_Weights.COCO_V1
@@ -39,17 +39,21 @@ class MaskRcnnSegmenter:
         """Weights and thresholds."""
         return f"maskrcnn {self._sha256} {_MIN_SCORE} {_ON_CAR}"
 
-    @torch.inference_mode()
     def segment(self, rgb: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
         """The cars, the surest first."""
+        import torch
+
         image = torch.from_numpy(rgb).permute(2, 0, 1).to(self._device).float() / 255
-        (found,) = self._model([image])
+        with torch.inference_mode():
+            (found,) = self._model([image])
         wanted = (found["scores"] >= _MIN_SCORE) & torch.isin(found["labels"].cpu(), self._vehicles).to(self._device)
         return label_map((found["masks"][wanted, 0] > _ON_CAR).cpu().numpy())
 
 
 def _load(file: Path, url: str, expected: dict[str, Any]) -> dict[str, Any]:
     """The weights, fetched first if they are torchvision's and not there yet."""
+    import torch
+
     if not file.is_file() and file.name == url.rsplit("/", 1)[-1]:
         try:
             file.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,7 @@
 """What a segmenter is: an image in, the cars in it out, each as a number in a map of labels."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
@@ -12,6 +11,7 @@ MAX_CARS = 20
 _SMALLEST_SHARE = 5e-4  # of the image; what is smaller is noise
 
 
+@runtime_checkable
 class Segmenter(Protocol):
     """A segmenter that is ready to run."""
 
@@ -39,6 +39,8 @@ def label_map(masks: Bool[np.ndarray, "m h w"]) -> UInt8[np.ndarray, "h w"]:
 
 def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """The largest connected part with everything that it encloses."""
+    import cv2
+
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     filled = np.zeros(mask.shape, dtype=np.uint8)
     if outlines:

@@ -253,7 +253,7 @@ from pathlib import Path
 signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs ignore
 from kronc_ns.capture.detection.detector import CarImage
 from kronc_ns.capture.detection.pifpaf import OpenPifPafDetector
-from kronc_ns.console import exit_on_error
+from kronc_ns.commands.console import exit_on_error
 with exit_on_error():
     list(OpenPifPafDetector(None, Path(sys.argv[1])).detect([CarImage(Path(sys.argv[2]))]))
 """

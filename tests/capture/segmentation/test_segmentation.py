@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kronc_ns.capture.segmentation import choice, mask_rcnn
+from kronc_ns.capture.segmentation import choice
 from kronc_ns.capture.segmentation.choice import SegmenterOptions, segment_car
 from kronc_ns.capture.segmentation.mask_rcnn import MaskRcnnSegmenter
 from kronc_ns.capture.segmentation.saliency import SaliencySegmenter
@@ -174,7 +174,7 @@ def test_weights_that_cannot_be_had_are_named(tmp_path: Path, monkeypatch: pytes
     def offline(*_, **__):
         raise OSError("no network")
 
-    monkeypatch.setattr(mask_rcnn.torch.hub, "download_url_to_file", offline)
+    monkeypatch.setattr(torch.hub, "download_url_to_file", offline)
     name = r"maskrcnn_resnet50_fpn_v2_coco-\w+\.pth"
     with pytest.raises(KroncError, match=rf"cannot be had \(no network\).*put it at .*hub/checkpoints/{name}"):
         MaskRcnnSegmenter(None)
