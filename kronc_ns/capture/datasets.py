@@ -17,9 +17,8 @@ from kronc_ns.capture.images import copy_upright, upright_size
 from kronc_ns.capture.source import IMAGE_SUFFIXES, list_images
 from kronc_ns.errors import KroncError
 from kronc_ns.files.images import read_mask
-from kronc_ns.files.keypoints import FORMATS, read_keypoints, write_keypoints
+from kronc_ns.files.keypoints import FORMATS, match_keypoints, read_keypoints, write_keypoints
 from kronc_ns.files.output import claim_output, read_json, release_output, write_json
-from kronc_ns.files.scene_folder import match_keypoints
 from kronc_ns.files.transforms import read_poses, transforms_dict
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import KeypointSchema
@@ -162,7 +161,7 @@ def _read_colmap(data: Path) -> tuple[Camera, dict[str, Float[np.ndarray, "3 4"]
     if focal is not None:
         values |= {"fx": focal, "fy": focal}
     poses = {
-        PurePosixPath(image.name).name: np.asarray(image.cam_from_world().inverse().matrix())
+        PurePosixPath(image.name).name: image.cam_from_world().inverse().matrix()
         for image in model.images.values()
         if image.has_pose
     }

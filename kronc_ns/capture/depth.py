@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from kronc_ns.capture.detection.model import file_sha256
-from kronc_ns.capture.detection.pixels import read_rgb
 from kronc_ns.capture.pretrained import load_pretrained, transformers_for
-from kronc_ns.capture.source import Count
+from kronc_ns.capture.progress import Count
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import cache_folder
 from kronc_ns.files.images import depth_under
@@ -117,6 +116,8 @@ def _map_of(estimator: DepthEstimator, image: Path) -> Float[np.ndarray, "h w"]:
     key = hashlib.sha256(f"{estimator.identity}\n{file_sha256(image)}".encode()).hexdigest()
     file = cache_folder() / "depths" / key[:2] / f"{key[2:]}.npy"
     if not file.exists():
+        from kronc_ns.capture.detection.pixels import read_rgb
+
         depth = estimator.estimate(read_rgb(image)).astype(np.float32)
         with atomic_path(file) as temporary:
             np.save(temporary, depth)

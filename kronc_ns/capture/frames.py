@@ -22,8 +22,9 @@ from kronc_ns.capture.images import (
     upright_size,
     write_downscales,
 )
+from kronc_ns.capture.progress import Count
 from kronc_ns.capture.selection import Sampling
-from kronc_ns.capture.source import IMAGE_SUFFIXES, MIN_FRAMES, Count, Source
+from kronc_ns.capture.source import IMAGE_SUFFIXES, MIN_FRAMES, Source
 from kronc_ns.capture.video import VideoFrames, probe_video
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import read_json, write_json

@@ -173,7 +173,7 @@ def _centred(focal_px: float, size: tuple[int, int]) -> Camera:
     return Camera(focal_px, focal_px, size[0] / 2, size[1] / 2, *size)
 
 
-def _aspect(size: tuple[float, float]) -> float:
+def _aspect(size: tuple[int, int] | tuple[float, float]) -> float:
     return max(size) / min(size)
 
 

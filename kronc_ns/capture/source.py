@@ -2,7 +2,6 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -22,8 +21,6 @@ PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 """What is taken of a folder of photos."""
 MIN_FRAMES = 3
 """Fewer views cannot be solved."""
-Count = Callable[[int, int, None], None]
-"""Progress of files: called with (done, all, None)."""
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from av.error import FFmpegError
 from jaxtyping import UInt8
 from PIL import Image
 
+from kronc_ns.capture.progress import Count
 from kronc_ns.capture.selection import Candidate, Sampling, choose
-from kronc_ns.capture.source import MIN_FRAMES, Count
+from kronc_ns.capture.source import MIN_FRAMES
 from kronc_ns.capture.tone import srgb
 from kronc_ns.errors import KroncError
 

@@ -2,11 +2,12 @@
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
 
+from kronc_ns.capture.depth import with_depths
 from kronc_ns.commands.console import solving
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import fingerprint
@@ -45,21 +46,6 @@ def expand(patterns: Sequence[Path]) -> list[Path]:
     if not folders:
         raise KroncError("--data is empty: expected at least one scene folder")
     return folders
-
-
-def add_depths(
-    scene: Scene,
-    folder: Path,
-    config: KroncConfig,
-    weights: Path | None,
-    progress: Callable[[int, int, float | None], None] | None = None,
-) -> Scene:
-    """The scene with the depths that ``config`` starts from, if it wants any."""
-    if config.depth_init == "random" and weights is None:
-        return scene
-    from kronc_ns.capture.depth import with_depths  # torch and OpenCV
-
-    return with_depths(scene, folder, config, weights, progress)
 
 
 def solve_folders(
@@ -104,7 +90,7 @@ def _solve_some(
     scenes: dict[Path, Scene] = {}
     for folder in folders:
         try:
-            scenes[folder] = add_depths(load_scene(folder), folder, config, depth_weights)
+            scenes[folder] = with_depths(load_scene(folder), folder, config, depth_weights)
         except (KroncError, OSError) as error:
             outcomes[folder] = Outcome(folder, "error", str(error))
     solutions = solve_scenes(list(scenes.values()), config)

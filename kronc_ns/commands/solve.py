@@ -27,7 +27,8 @@ class Solve(SolverOptions):
         """Solve and write."""
         from rich.console import Console
 
-        from kronc_ns.commands.batch import add_depths, expand, solve_folders
+        from kronc_ns.capture.depth import with_depths
+        from kronc_ns.commands.batch import expand, solve_folders
         from kronc_ns.commands.console import exit_status, progress_bar, report_table, solving
         from kronc_ns.files.cache import fingerprint
         from kronc_ns.files.output import claim_output
@@ -45,7 +46,7 @@ class Solve(SolverOptions):
         if self.output_dir.resolve() == folders[0].resolve():
             raise KroncError(f"--output-dir {self.output_dir} is the scene itself: choose another folder")
         with progress_bar("estimating depths") as progress:
-            scene = add_depths(scene, folders[0], config, self.depth_weights, progress)
+            scene = with_depths(scene, folders[0], config, self.depth_weights, progress)
         claim_output(self.output_dir)
         with solving() as progress:
             solution = solve_scene(scene, config, progress)

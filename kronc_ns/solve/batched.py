@@ -149,7 +149,7 @@ def _iterate(problem: Problems, search: _Search, config: LmConfig) -> tuple[_Sea
 
 
 def _follow(problem: Problems, search: _Search, settled: Bool[Tensor, "b"]) -> tuple[_Search, Bool[Tensor, "b"]]:
-    """Follow the residuals with the scale of the loss; move settled scenes to their next phase (`robust.next_phase`)."""
+    """Follow the residuals with the scale of the loss; move settled scenes on (`robust.next_phase`)."""
     phase, length, seen = search.phase, search.residual.length, problem.weight > 0
     shrunk = torch.minimum(search.sigma, _noise(problem, search.residual) * problem.redundancy)
     sigma = torch.where(phase != robust.TRIMMED, shrunk, search.sigma)

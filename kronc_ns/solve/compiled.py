@@ -30,7 +30,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     GNU's OpenMP a fork after their first use ends the process. The functions release the interpreter lock instead.
     """
     # error_model: a division that may raise ends the vector instructions
-    result = numba.njit(nogil=True, fastmath=_FASTMATH, error_model="numpy")(function)
+    result: Any = numba.njit(nogil=True, fastmath=_FASTMATH, error_model="numpy")(function)
     with contextlib.suppress(RuntimeError):  # neither __pycache__ nor the user's cache nor NUMBA_CACHE_DIR
         result._cache = _StampedCache(function)
     return result

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from kronc_ns.geometry.rotations import skew
-from kronc_ns.solve import schur
+from kronc_ns.solve import records, schur
 from kronc_ns.solve.compiled import compiled
 from kronc_ns.solve.linear import dot, factor, forward
 from kronc_ns.solve.problem import Problem, State
@@ -39,8 +39,8 @@ def camera_covariance(
         refine=problem.refine,
         points_known=problem.points_known,
     )
-    data = schur.measured(chosen)
-    now, work = schur.estimate(data, state), schur.system(data, *problem.weight.shape, with_cameras=True)
+    data = records.measured(chosen)
+    now, work = records.estimate(data, state), records.system(data, *problem.weight.shape, with_cameras=True)
     covariance = np.empty((len(problem.weight), 6, 6))
     schur.evaluate(data, now)
     work.weight[:] = data.own

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 
-from kronc_ns.solve import robust, schur
+from kronc_ns.solve import records, robust, schur
 from kronc_ns.solve.compiled import is_compiled
 from kronc_ns.solve.options import LmConfig
 from kronc_ns.solve.problem import Problem, State
@@ -50,9 +50,9 @@ def adjust(
     detections that they can be met exactly, the residuals do not tell it.
     """
     config = config or LmConfig()
-    data, redundancy = schur.measured(problem), problem.redundancy
-    now, trial = schur.estimate(data, start), schur.estimate(data, start)
-    work = schur.system(data, *problem.weight.shape)
+    data, redundancy = records.measured(problem), problem.redundancy
+    now, trial = records.estimate(data, start), records.estimate(data, start)
+    work = records.system(data, *problem.weight.shape)
     detections = max(len(data.joint), 1)
 
     schur.evaluate(data, now)
@@ -105,6 +105,6 @@ def is_ready() -> bool:
     return is_compiled(schur.reduce_system)
 
 
-def _state(now: schur.Estimate) -> State:
+def _state(now: records.Estimate) -> State:
     log_growth, k1 = now.intrinsics.tolist()
     return State(now.rotation.copy(), now.translation.copy(), now.points.copy(), log_growth, k1)

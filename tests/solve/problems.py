@@ -9,7 +9,7 @@ from jaxtyping import Float
 from kronc_ns.fit.starts import circular_poses
 from kronc_ns.geometry.alignment import Similarity, pose_errors
 from kronc_ns.geometry.rotations import so3_exp
-from kronc_ns.solve import schur
+from kronc_ns.solve import records, schur
 from kronc_ns.solve.problem import OrbitPrior, Problem, ShapePrior, State
 from kronc_ns.synthetic.variations import noisy_poses
 
@@ -81,10 +81,10 @@ def errors(found: State, truth: State) -> tuple[Float[np.ndarray, "n"], Float[np
     return pose_errors(found.c2w, truth.c2w)
 
 
-def evaluated(problem: Problem, state: State) -> schur.Estimate:
+def evaluated(problem: Problem, state: State) -> records.Estimate:
     """A state with all that follows from it, as the compiled loops have it."""
-    data = schur.measured(problem)
-    now = schur.estimate(data, state)
+    data = records.measured(problem)
+    now = records.estimate(data, state)
     schur.evaluate(data, now)
     return now
 

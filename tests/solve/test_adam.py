@@ -82,10 +82,14 @@ def test_progress_is_reported_about_a_hundred_times():
 
 
 def test_one_thread_computes_and_the_others_are_given_back():
-    threads, inside = torch.get_num_threads(), []
-    run(AdamConfig(steps=2), progress=lambda step, value: inside.append(torch.get_num_threads()))
+    inside = []
+    torch.set_num_threads(2)
+    try:
+        run(AdamConfig(steps=2), progress=lambda step, value: inside.append(torch.get_num_threads()))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
     assert set(inside) == {1}
-    assert torch.get_num_threads() == threads
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU on this machine")

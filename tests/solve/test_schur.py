@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kronc_ns.geometry.rotations import skew
-from kronc_ns.solve import robust, schur
+from kronc_ns.solve import records, robust, schur
 from kronc_ns.solve.problem import Problem, State
 from tests.solve import book
 from tests.solve.problems import (
@@ -31,9 +31,9 @@ class Step:
     """A step of the compiled solver."""
 
     def __init__(self, problem: Problem, state: State, weight: np.ndarray, damping: float) -> None:
-        data = schur.measured(problem)
-        self.now, self.to = evaluated(problem, state), schur.estimate(data, state)
-        self.work = schur.system(data, *problem.weight.shape)
+        data = records.measured(problem)
+        self.now, self.to = evaluated(problem, state), records.estimate(data, state)
+        self.work = records.system(data, *problem.weight.shape)
         self.work.weight[:] = weight[problem.weight > 0]
         schur.reduce_system(data, self.now, self.work, damping, BELIEF, VARIANCE)
         lower = np.tril(self.work.matrix)
@@ -51,7 +51,7 @@ def assert_alike(ours: State, theirs: State, rtol: float = 1e-7, atol: float = 1
 def test_the_rows_of_every_view_are_the_derivatives_of_its_projections(variant):
     """Focal lengths differ and the lens bends."""
     problem, state, weight = posed(variant)
-    data, now = schur.measured(problem), evaluated(problem, state)
+    data, now = records.measured(problem), evaluated(problem, state)
     jacobian, residual = (x.reshape(-1, 2, *x.shape[1:]) for x in book.jacobian(problem, state, weight))
     cameras, points, _ = book.unknowns(problem)
     joints = problem.weight.shape[1]
@@ -111,9 +111,9 @@ def test_the_gradient_of_the_cost_vanishes_where_steps_do(variant, phase):
     """What is reduced is the cost that is compared: after many steps any other direction costs more."""
     problem, state, _ = posed(variant)
     state = replace(state, log_growth=0.0, k1=0.0)
-    data, sigma = schur.measured(problem), 3.0
+    data, sigma = records.measured(problem), 3.0
     now, trial = evaluated(problem, state), evaluated(problem, state)
-    work = schur.system(data, *problem.weight.shape)
+    work = records.system(data, *problem.weight.shape)
     cost, damping = schur.total_cost(data, now, sigma, phase), 1e-3
     for _ in range(100):
         proposed = schur.propose(data, now, trial, work, sigma, phase, damping)
@@ -180,7 +180,7 @@ def test_a_shape_prior_leaves_no_gauge():
 
 def test_the_orbits_error_is_the_centres_distance_from_where_it_is_expected():
     problem, state, _ = posed("orbit")
-    data, now = schur.measured(problem), evaluated(problem, state)
+    data, now = records.measured(problem), evaluated(problem, state)
     error = np.array([[schur.orbit_error(data, now, n, c) for c in range(3)] for n in range(len(state.rotation))])
     expected = problem.orbit.centre - state.c2w[..., 3]
     np.testing.assert_allclose((state.rotation.swapaxes(1, 2) @ error[..., None])[..., 0], expected)
@@ -224,9 +224,9 @@ def test_points_behind_a_camera_are_far_off_and_pull_at_nothing():
 def test_no_step_is_nan_not_an_answer():
     problem, state, _ = posed("plain")
     state.points[0] = np.nan
-    data, now = schur.measured(problem), evaluated(problem, state)
-    work = schur.system(data, *problem.weight.shape)
-    assert math.isnan(schur.propose(data, now, schur.estimate(data, state), work, 1.0, robust.CAUCHY, 1e-3))
+    data, now = records.measured(problem), evaluated(problem, state)
+    work = records.system(data, *problem.weight.shape)
+    assert math.isnan(schur.propose(data, now, records.estimate(data, state), work, 1.0, robust.CAUCHY, 1e-3))
 
 
 def test_arrays_of_any_layout_are_compiled_once():

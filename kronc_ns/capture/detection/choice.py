@@ -9,7 +9,8 @@ import numpy as np
 from typing_extensions import assert_never
 
 from kronc_ns.capture.detection.detector import CarImage, Detector
-from kronc_ns.capture.detection.store import Progress, detect_all
+from kronc_ns.capture.detection.store import detect_all
+from kronc_ns.capture.progress import Count
 from kronc_ns.errors import KroncError
 from kronc_ns.files.keypoints import Detections
 
@@ -64,7 +65,7 @@ def find_keypoints(
     names: Sequence[str],
     size: tuple[int, int],
     masks: Sequence[str] | None = None,
-    progress: Progress | None = None,
+    progress: Count | None = None,
 ) -> Detections:
     """All cars in the images ``names`` (and ``masks``) of ``folder``, as a keypoint file would hold them.
 

@@ -34,7 +34,7 @@ class CompositeFieldDetector:
         if len(shape) != 5 or not isinstance(shape[1], int) or shape[2] != 5:
             raise KroncError(f"{weights} gives {shape}: expected intensity fields [1, points, 5, height, width]")
         self.schema: KeypointSchema = self._model.schema(shape[1])
-        self._stride = self._model.number("stride", 8)
+        self._stride = self._model.number("stride", 8.0)
         self._threshold = self._model.number("threshold", 0.1)
 
     @property

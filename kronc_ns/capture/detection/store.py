@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,14 @@ import numpy as np
 
 from kronc_ns.capture.detection.detector import CarDetection, CarImage, Detector
 from kronc_ns.capture.detection.model import file_sha256
+from kronc_ns.capture.progress import Count
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import cache_folder
 from kronc_ns.files.output import read_json, write_json
 
-Progress = Callable[[int, int, None], None]
-
 
 def detect_all(
-    detector: Detector, images: Sequence[CarImage], progress: Progress | None = None
+    detector: Detector, images: Sequence[CarImage], progress: Count | None = None
 ) -> list[list[CarDetection]]:
     """The cars in each image: those kept from before, and the others detected now and kept one by one."""
     files = [_file(detector, image) for image in images]

@@ -13,8 +13,8 @@ from typing_extensions import assert_never
 
 from kronc_ns.capture.detection.model import file_sha256
 from kronc_ns.capture.detection.pixels import MAX_LONG_SIDE, read_rgb, shrink
+from kronc_ns.capture.progress import Count
 from kronc_ns.capture.segmentation.segmenter import Segmenter
-from kronc_ns.capture.source import Count
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import cache_folder
 from kronc_ns.files.output import atomic_path
