@@ -1,4 +1,4 @@
-"""Shared fixtures; jaxtyping annotations are checked at run time in every test."""
+"""Shared fixtures."""
 
 import json
 import os
@@ -8,22 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import jaxtyping
 import numpy as np
 import pytest
-
-PACKAGE = Path(__file__).resolve().parents[1] / "kronc_ns"
-
-
-def checked_modules() -> list[str]:
-    """Every module whose shapes are checked at run time: all but those with functions to compile, which cannot be."""
-    unchecked = ("@compiled", "@formula", "import bpy", "# shapes unchecked")
-    files = [file for file in PACKAGE.rglob("*.py") if not any(mark in file.read_text() for mark in unchecked)]
-    return [".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts) for file in files if file.stem != "__init__"]
-
-
-# before any of them is imported
-_hook = jaxtyping.install_import_hook(checked_modules(), "beartype.beartype")
 
 from kronc_ns.files.output import claim_output
 from kronc_ns.files.record import write_solution

@@ -15,7 +15,10 @@ LAYERS = [
     {"commands", "plugin", "benchmark"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
-MAY_USE_TORCH = ("solve/adam", "solve/batched", "solve/tensors", "solve/objective", "plugin", "capture", "benchmark", "metrics/images")
+MAY_USE_TORCH = (
+    *("solve/adam", "solve/batched", "solve/tensors", "solve/objective", "plugin", "benchmark/cuda", "metrics/images"),
+    *("capture/depth", "capture/pretrained", "capture/segmentation", "capture/detection/isolated"),
+)
 FILES = sorted(file for file in PACKAGE.rglob("*.py") if file != PACKAGE / "__init__.py")
 
 

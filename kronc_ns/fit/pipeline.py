@@ -219,7 +219,10 @@ def _adam(scene: Scene, config: KroncConfig, progress: Progress | None) -> Attem
     settings = replace(config.adam, optimise_depths=config.adam.optimise_depths and not fixed)
     report = None if progress is None else lambda step, loss: progress(step, settings.steps, loss)
     result = minimise(
-        *(x[usable] for x in (initial, depths, scene.uv, scene.visibility)),
+        initial[usable],
+        depths[usable],
+        scene.uv[usable],
+        scene.visibility[usable],
         scene.camera,
         settings,
         config.device,

@@ -30,7 +30,8 @@ def repair(attempts: Sequence[Attempt], config: KroncConfig) -> list[Attempt]:
         changed: dict[int, Hypothesis] = {}
         for i in active:
             suspect = _suspects(attempts[i])
-            if not suspect.any() or (asked[i] is not None and np.array_equal(suspect, asked[i])):
+            before = asked[i]
+            if not suspect.any() or (before is not None and np.array_equal(suspect, before)):
                 continue
             asked[i] = suspect
             mended = _relocated(attempts[i], suspect)

@@ -95,13 +95,10 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     counted, found, good = (~np.isnan(error)).sum(1), scene.seen.sum(1), inlier.sum(1)
     rmse = np.sqrt(np.where(inlier, error**2, 0.0).sum(1) / np.maximum(good, 1))
     agree = agrees(good, counted)
+    numbers = (x.tolist() for x in (found, counted, good, agree, rmse))
     views = tuple(
-        _report(name, *numbers, evidence, i)
-        for i, (name, *numbers) in enumerate(
-            zip(
-                scene.names, found.tolist(), counted.tolist(), good.tolist(), agree.tolist(), rmse.tolist(), strict=True
-            )
-        )
+        _report(name, *rest, of=evidence, i=i)
+        for i, (name, *rest) in enumerate(zip(scene.names, *numbers, strict=True))
     )
     solved = np.array([view.status is ViewStatus.SOLVED for view in views], dtype=bool)
     kept = inlier & solved[:, None]

@@ -197,9 +197,14 @@ def minimise(
     """
     start = time.perf_counter()
     on = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
-    tensors = (torch.from_numpy(np.ascontiguousarray(x)).to(on, torch.float32) for x in (c2w, depths, uv, m))
+
+    def tensor(array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(on, torch.float32)
+
     focal, principal = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    gradient = LossGradient(*tensors, focal, principal, (config.weight_3d, config.weight_2d))
+    gradient = LossGradient(
+        tensor(c2w), tensor(depths), tensor(uv), tensor(m), focal, principal, (config.weight_3d, config.weight_2d)
+    )
     fused = on.type == "cuda" or torch.__version__ >= "2.4"
     optimiser = torch.optim.Adam([gradient.parameters], lr=config.learning_rate, fused=fused)
     report_every = max(1, config.steps // 100)
@@ -229,7 +234,13 @@ def minimise(
         points = gradient.centroids().T
     seconds = time.perf_counter() - start
     return AdamResult(
-        *(_array(x) for x in (gradient.pose(), gradient.z, points)), step, seconds, history, _array(torch.stack(path))
+        c2w=_array(gradient.pose()),
+        depths=_array(gradient.z),
+        points=_array(points),
+        steps=step,
+        seconds=seconds,
+        history=history,
+        path=_array(torch.stack(path)),
     )
 
 

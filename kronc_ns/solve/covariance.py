@@ -40,7 +40,7 @@ def camera_covariance(
         points_known=problem.points_known,
     )
     data = records.measured(chosen)
-    now, work = records.estimate(data, state), records.system(data, *problem.weight.shape, with_cameras=True)
+    now, work = records.estimate(data, state), records.system(data, *chosen.weight.shape, with_cameras=True)
     covariance = np.empty((len(problem.weight), 6, 6))
     schur.evaluate(data, now)
     work.weight[:] = data.own

@@ -52,7 +52,8 @@ def adjust(
     config = config or LmConfig()
     data, redundancy = records.measured(problem), problem.redundancy
     now, trial = records.estimate(data, start), records.estimate(data, start)
-    work = records.system(data, *problem.weight.shape)
+    views, joints = problem.weight.shape
+    work = records.system(data, views, joints)
     detections = max(len(data.joint), 1)
 
     schur.evaluate(data, now)
