@@ -1,6 +1,7 @@
 """kronc.json, the evidence beside a solution's transforms.json: a solved folder written, and read back."""
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -90,7 +91,8 @@ def read_record(folder: Path) -> dict[str, Any]:
 def read_solution(folder: Path) -> tuple[Scene, Solution]:
     """Scene and solution of a folder that `kronc solve` or `ns-process-data kronc` wrote, failed views included.
 
-    Both ``names`` are paths as seen from ``folder``, those of the view reports as in the scene that was solved. The
+    Both ``names`` are paths as seen from ``folder``, or as somebody has rewritten them in transforms.json since (told
+    by file name); those of the view reports are as in the scene that was solved. The
     scene's camera is the solved one, and its keypoints are the detections as the solver took them (left and right put
     right). Raises `KroncError` naming the file that is missing or broken.
     """
@@ -101,7 +103,7 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         points = _array(record["points"], (-1, 3))
         initial = _poses(record["initial_c2w"], len(views))
         path = np.stack([initial, *(_poses(step, len(views)) for step in record.get("path_c2w", []))])[1:]
-        history = {key: [float(value) for value in values] for key, values in record["history"].items()}
+        history = {key: _array(values, (-1,)).tolist() for key, values in record["history"].items()}
         overall: dict[str, Any] = {key: record[key] for key in ("reason", "solver", "init", "iterations", "seconds")}
         for key in ("rmse_px", "median_px"):
             overall[key] = math.nan if record[key] is None else float(record[key])
@@ -113,6 +115,7 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
     # of failed views transforms.json says nothing
     camera, _ = camera_and_frames({**read_json(transforms), "frames": record["views"]}, transforms)
     poses = read_poses(transforms)
+    names = _as_listed(names, poses)
     c2w = np.stack([poses.get(name, np.full((3, 4), np.nan)) for name in names])
     found = read_keypoints(folder / "keypoints.json")
     if len(points) != len(found.schema):
@@ -159,6 +162,15 @@ def left_out_views(folder: Path) -> set[str]:
 
 def _lacks(folder: Path, key: str) -> KroncError:
     return KroncError(f'{folder / "kronc.json"}: expected "{key}", as `kronc solve` writes them: solve again')
+
+
+def _as_listed(names: Sequence[str], listed: Iterable[str]) -> tuple[str, ...]:
+    """Paths as they are listed, matched by file name where that tells them apart."""
+    listed = {*listed}
+    by_file_name = {PurePosixPath(path).name: path for path in listed}
+    if len({PurePosixPath(name).name for name in names}) < len(names):
+        return tuple(names)
+    return tuple(name if name in listed else by_file_name.get(PurePosixPath(name).name, name) for name in names)
 
 
 def _view(view: dict[str, Any]) -> ViewReport:

@@ -158,6 +158,28 @@ def test_what_is_read_is_what_was_solved(tmp_path, swapped_lap):
     assert again.names == again_scene.names == tuple(f"../scene/{name}" for name in scene.names)
 
 
+def test_paths_that_were_rewritten_since_are_told_by_file_name(tmp_path, swapped_lap, edit):
+    scene, solution = swapped_lap
+    folder = written(tmp_path, scene, solution)
+
+    def move(content):
+        for frame in content["frames"]:
+            frame["file_path"] = f"/elsewhere/{frame['file_path'].split('/')[-1]}"
+
+    edit(folder / "transforms.json", move)
+    _, again = read_solution(folder)
+    np.testing.assert_allclose(again.c2w, solution.c2w, atol=1e-12)
+    posed = [name for name, there in zip(again.names, again.posed, strict=True) if there]
+    assert all(name.startswith("/elsewhere/") for name in posed)
+
+
+def test_a_loss_that_was_not_finite_is_read_as_that(tmp_path, swapped_lap):
+    scene, solution = swapped_lap
+    history = {"step": [1.0, 2.0], "loss": [math.inf, 3.0]}
+    _, again = read_solution(written(tmp_path, scene, replace(solution, history=history)))
+    np.testing.assert_array_equal(again.history["loss"], [math.nan, 3.0])
+
+
 def test_detections_come_back_with_left_and_right_put_right(tmp_path, swapped_lap):
     """Then the solved points explain them as well as the solver said, view by view."""
     scene, solution = swapped_lap

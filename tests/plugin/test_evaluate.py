@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import os
 import shutil
 
 import numpy as np
@@ -49,16 +48,12 @@ def changed(trained, data, tmp_path):
     def make(edit=lambda transforms: None, **options):
         copy = tmp_path / "data"
         shutil.copytree(data, copy)
-        content, record = (json.loads((data / name).read_text()) for name in ("transforms.json", "kronc.json"))
+        content = json.loads((data / "transforms.json").read_text())
         for frame in content["frames"]:
             for key in ("file_path", "mask_path"):
                 frame[key] = str((data / frame[key]).resolve())
         edit(content)
-        record["data"] = "."
-        for frame, view in zip(content["frames"], record["views"], strict=True):
-            frame["file_path"] = view["file_path"] = os.path.relpath(frame["file_path"], copy)
         (copy / "transforms.json").write_text(json.dumps(content))
-        (copy / "kronc.json").write_text(json.dumps(record))
         config = yaml.load(trained.read_text(), Loader=yaml.Loader)
         manager = config.pipeline.datamanager
         manager.data = copy
