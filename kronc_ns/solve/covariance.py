@@ -37,7 +37,6 @@ def camera_covariance(
         problem.focal,
         problem.shape,
         refine=problem.refine,
-        points_known=problem.points_known,
     )
     data = records.measured(chosen)
     now, work = records.estimate(data, state), records.system(data, *chosen.weight.shape, with_cameras=True)
