@@ -29,8 +29,17 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     Not numba's own parallel loops: their threads fight with torch's for the cores when something else runs, and with
     GNU's OpenMP a fork after their first use ends the process. The functions release the interpreter lock instead.
     """
+    return _kept(function, nogil=True)
+
+
+def compiled_briefly(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`compiled` of what takes microseconds: to wait for the interpreter lock afterwards would take longer."""
+    return _kept(function, nogil=False)
+
+
+def _kept(function: Callable[..., Any], nogil: bool) -> Callable[..., Any]:
     # error_model: a division that may raise ends the vector instructions
-    result: Any = numba.njit(nogil=True, fastmath=_FASTMATH, error_model="numpy")(function)
+    result: Any = numba.njit(nogil=nogil, fastmath=_FASTMATH, error_model="numpy")(function)
     with contextlib.suppress(RuntimeError):  # neither __pycache__ nor the user's cache nor NUMBA_CACHE_DIR
         result._cache = _StampedCache(function)
     return result

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from kronc_ns.solve.compiled import compiled
+from kronc_ns.solve.compiled import compiled, compiled_briefly
 
 
 @compiled
@@ -61,7 +61,7 @@ def inverse_factor(matrix: Any, out: Any) -> None:
             out[i, j] = total / matrix[i, i]
 
 
-@compiled
+@compiled_briefly
 def factor(matrix: Any) -> Any:
     """Cholesky's factor in place of the lower triangle; False where it is not positive definite."""
     size = len(matrix)
@@ -115,7 +115,7 @@ def solve(matrix: Any, rhs: Any) -> Any:
     return True
 
 
-@compiled
+@compiled_briefly
 def forward(lower: Any, rows: Any) -> None:
     """Every row x becomes the solution y of ``lower`` y = x; entries past its size stay. Rows in multiples of 6."""
     for p in range(0, len(rows), 6):

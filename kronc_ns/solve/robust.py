@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numba.extending import overload
 from typing_extensions import assert_never
 
-from kronc_ns.solve.compiled import compiled, formula
+from kronc_ns.solve.compiled import compiled, compiled_briefly, formula
 from kronc_ns.solve.options import Loss
 
 INLIER_SIGMAS = 4.5
@@ -124,7 +124,7 @@ def spread_px(squares: Any, count: Any, redundancy: Any) -> Any:
     return (squares / (2.0 * count)) ** 0.5 * redundancy
 
 
-@compiled
+@compiled_briefly
 def weigh(length: Any, own: Any, sigma: Any, phase: Any, out: Any) -> None:
     """IRLS weights times the detections' ``own``."""
     for k in range(len(length)):
@@ -138,7 +138,7 @@ def weigh(length: Any, own: Any, sigma: Any, phase: Any, out: Any) -> None:
             out[k] = own[k]
 
 
-@compiled
+@compiled_briefly
 def cost(length: Any, sigma: Any, phase: Any) -> Any:
     """What detections cost together, in squared pixels."""
     total = 0.0
@@ -159,7 +159,7 @@ def cost(length: Any, sigma: Any, phase: Any) -> Any:
     return total
 
 
-@compiled
+@compiled_briefly
 def noise(length: Any, work: Any) -> Any:
     """`noise_px` of all residuals, 1 where there are none; ``work`` is as long as ``length``."""
     if len(length) == 0:
@@ -170,7 +170,7 @@ def noise(length: Any, work: Any) -> Any:
     return max(median, SIGMA_FLOOR_PX) if median < np.inf else 1.0
 
 
-@compiled
+@compiled_briefly
 def next_phase(length: Any, sigma: Any, phase: Any, shrunk: Any, redundancy: Any) -> Any:
     """Phase, sigma and whether it is over, when a phase has settled; ``shrunk`` is the noise that residuals show.
 

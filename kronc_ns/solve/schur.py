@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from kronc_ns.solve.compiled import compiled
+from kronc_ns.solve.compiled import compiled, compiled_briefly
 from kronc_ns.solve.linear import dot, exponential, inverse_factor, solve
 from kronc_ns.solve.projection import (
     BEHIND_PX,
@@ -29,7 +29,7 @@ TINY = 1e-12
 """Diagonal entries up to this say nothing; their unknowns stay where they are."""
 
 
-@compiled
+@compiled_briefly
 def evaluate(data: Measured, now: Estimate) -> None:
     """Reproject all points, and see how unusual they are: everything in ``now`` that follows from its unknowns."""
     growth, k1 = np.exp(now.intrinsics[0]), now.intrinsics[1]
