@@ -19,7 +19,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, report_table
+from kronc_ns.commands.console import exit_on_error, exit_status, report_table, solving
 from kronc_ns.commands.options import SolverOptions
 from kronc_ns.files.cache import solve_cached
 from kronc_ns.files.record import read_record, read_solution
@@ -94,7 +94,7 @@ class KroncDataParser(DataParser):
         check_file_names(scene.names, config.data / "transforms.json")
         folder = config.data
         if not (folder / "kronc.json").exists() or config.keypoints is not None or config.any_solver_option():
-            with progress_bar("solving poses") as progress:
+            with solving("solving poses") as progress:
                 folder = solve_cached(config.data, scene, config.solver_config(), progress)
         record = read_record(folder)
         CONSOLE.print(report_table(record, scene.notes))

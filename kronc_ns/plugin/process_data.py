@@ -20,7 +20,7 @@ from kronc_ns.capture.segmentation.choice import SegmenterOptions, segment_car
 from kronc_ns.capture.segmentation.segmenter import Segmenter
 from kronc_ns.capture.selection import Sampling
 from kronc_ns.capture.source import Source, find_source
-from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, report_table
+from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, report_table, solving
 from kronc_ns.commands.options import SolverOptions
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import fingerprint
@@ -125,7 +125,7 @@ class KroncToNerfstudio:
             config = replace(config, refine_focal=True)
         with progress_bar("estimating depths") as progress:
             scene = with_depths(scene, out, config, self.depth_weights, progress)
-        with progress_bar("solving") as progress:
+        with solving() as progress:
             solution = solve_scene(scene, config, progress)
         report = write_solution(out, scene, solution, out, fingerprint(scene, config))
 

@@ -1,5 +1,6 @@
 """What a fresh process imports: torch takes 2 s, a solve of 100 views 12 ms."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -71,3 +72,17 @@ def test_export(lap_folder, form):
 def test_report(lap_folder):
     assert not imported("report", "--data", lap_folder / "out") & NEVER
     assert (lap_folder / "out/report.html").exists()
+
+
+@pytest.mark.slow
+def test_the_first_solve_on_a_machine_says_that_it_compiles_and_the_next_does_not(lap_folder, tmp_path):
+    def said() -> str:
+        arguments = ("solve", "--data", str(lap_folder / "walk"), "--output-dir", str(tmp_path / "new"))
+        command = [sys.executable, "-m", "kronc_ns.commands.main", *arguments]
+        fresh = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=fresh)
+        assert done.returncode == 0, done.stderr
+        return done.stderr
+
+    assert said() == "compiling the solver for this machine, once (about 10 s)\n"
+    assert said() == ""
