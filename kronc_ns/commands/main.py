@@ -1,5 +1,6 @@
 """The `kronc` command."""
 
+import gc
 from typing import Annotated
 
 import tyro
@@ -30,6 +31,7 @@ Command = (
 
 def main() -> None:
     """Entry point of `kronc`."""
+    gc.set_threshold(100_000)  # while modules load, to look for garbage at every 700 objects is a tenth of a solve
     command = tyro.cli(
         Command, prog="kronc", description="Camera poses of a walk around a car from semantic keypoints."
     )
