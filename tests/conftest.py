@@ -33,6 +33,12 @@ def seeded() -> None:
 
 
 @pytest.fixture(scope="session")
+def compiled_solver(lap: Capture) -> None:
+    """The solver is there: commands say nothing of compiling it."""
+    solve_scene(scene_of(lap), KroncConfig())
+
+
+@pytest.fixture(scope="session")
 def spin_suv() -> Path:
     """The real turntable capture beside the project."""
     folder = SHARED_DATA / "spin_suv"

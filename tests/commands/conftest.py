@@ -28,7 +28,7 @@ class Result(NamedTuple):
 
 
 @pytest.fixture
-def kronc(monkeypatch, capsys):
+def kronc(monkeypatch, capsys, compiled_solver):
     """Run `kronc ARGUMENTS` in this process."""
 
     def run(*arguments) -> Result:

@@ -17,7 +17,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="package", autouse=True)
-def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def _cache(tmp_path_factory: pytest.TempPathFactory, compiled_solver: None) -> Iterator[None]:
     """One cache for all tests, for the commands that they start, too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KRONC_NS_CACHE", str(tmp_path_factory.mktemp("cache")))
