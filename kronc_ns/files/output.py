@@ -44,19 +44,20 @@ def write_json(path: Path, content: Any) -> None:
 
     A line for each entry of the whole, and of each list in it: as legible, and ten times as fast as an indent.
     """
-    text = _lines(content, 2)
+    if isinstance(content, dict):
+        text = "{\n" + ",\n".join(f"{json.dumps(str(key))}: {_rows(value)}" for key, value in content.items()) + "\n}"
+    else:
+        text = _rows(content)
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(text + "\n")
         file.flush()
         os.fsync(file.fileno())
 
 
-def _lines(content: Any, depth: int) -> str:
-    if depth == 2 and isinstance(content, dict):
-        entries = [f"{json.dumps(str(key))}: {_lines(value, depth - 1)}" for key, value in content.items()]
-        return "{\n" + ",\n".join(entries) + "\n}"
-    if depth and isinstance(content, (list, tuple)) and any(isinstance(value, (dict, list)) for value in content):
-        return "[\n" + ",\n".join(_lines(value, 0) for value in content) + "\n]"
+def _rows(content: Any) -> str:
+    """JSON, a list of lists or objects with a line for each."""
+    if isinstance(content, (list, tuple)) and any(isinstance(value, (dict, list)) for value in content):
+        return "[\n" + ",\n".join(json.dumps(value, allow_nan=False) for value in content) + "\n]"
     return json.dumps(content, allow_nan=False)
 
 
