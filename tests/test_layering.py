@@ -11,12 +11,13 @@ LAYERS = [
     {"keypoints", "scene", "solution"},
     {"solve"},
     {"fit"},
-    {"show", "capture", "synthetic", "metrics", "files"},
+    {"show", "capture", "training", "synthetic", "metrics", "files"},
     {"commands", "plugin", "benchmark"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 MAY_USE_TORCH = (
     *("solve/adam", "solve/batched", "solve/tensors", "solve/objective", "plugin", "benchmark/cuda", "metrics/images"),
+    *("training/network", "training/loss", "training/loop", "training/export"),
     *("capture/depth", "capture/pretrained", "capture/segmentation", "capture/detection/isolated"),
 )
 FILES = sorted(file for file in PACKAGE.rglob("*.py") if file != PACKAGE / "__init__.py")

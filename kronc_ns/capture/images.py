@@ -7,6 +7,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from kronc_ns.errors import KroncError
@@ -28,16 +29,38 @@ def read_heif(path: Path) -> None:
 
 def load_image(path: Path) -> Image.Image:
     """The whole decoded image as it is stored (EXIF orientation not applied), 8 bits a channel."""
+    image = _load(path)
+    if image.mode.startswith(("I", "F")):
+        raise KroncError(f"{path} has {image.mode} pixels: expected 8 bits a channel; convert it")
+    return image
+
+
+def load_small(path: Path, long_side: int) -> Image.Image:
+    """The image as it is stored, as cheaply as its format allows, not below ``long_side`` px where it is larger.
+
+    JPEG is decoded at a half, a quarter or an eighth; 16-bit grey becomes 8-bit.
+    """
+    image = _load(path, long_side)
+    if image.mode.startswith("I"):
+        # 16-bit files may come as 32-bit pixels
+        return Image.fromarray((np.asarray(image, dtype=np.int64).clip(0, 65535) // 257).astype(np.uint8))
+    if image.mode.startswith("F"):
+        raise KroncError(f"{path} has floating-point pixels: expected 8 or 16 bits a channel; convert it")
+    return image
+
+
+def _load(path: Path, long_side: int | None = None) -> Image.Image:
     try:
         with Image.open(path) as image:
+            if long_side is not None and max(image.size) > long_side:
+                factor = long_side / max(image.size)
+                image.draft(None, (math.ceil(factor * image.width), math.ceil(factor * image.height)))
             image.load()
     except FileNotFoundError:
         raise KroncError(f"{path} does not exist") from None
     except _READ_ERRORS as error:
         reason = "no image format" if "cannot identify" in str(error) else str(error)
         raise KroncError(f"{path} is no image that can be read ({reason}): replace or remove it") from None
-    if image.mode.startswith(("I", "F")):
-        raise KroncError(f"{path} has {image.mode} pixels: expected 8 bits a channel; convert it")
     return image
 
 

@@ -60,6 +60,15 @@ def find_source(data: Path) -> Source:
     return Source(data, "video", (), ())
 
 
+def find_images(data: Path) -> Source:
+    """`find_source` of images that need not make a scene: a single photo will do."""
+    if data.is_file() and data.suffix.lower() in PHOTO_SUFFIXES:
+        if data.suffix.lower() in HEIF_SUFFIXES:
+            read_heif(data)
+        return Source(data, "photos", (data,), (data.name,))
+    return find_source(data)
+
+
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key under which img2 comes before img10."""
     return [

@@ -8,6 +8,7 @@ import tyro
 from kronc_ns.commands.bench import Bench
 from kronc_ns.commands.console import exit_on_error
 from kronc_ns.commands.convert_detector import ConvertDetector
+from kronc_ns.commands.detect import Detect
 from kronc_ns.commands.eval import Eval
 from kronc_ns.commands.export import Export
 from kronc_ns.commands.import_data import Import
@@ -18,6 +19,7 @@ from kronc_ns.commands.view import View
 
 Command = (
     Annotated[Solve, tyro.conf.subcommand("solve")]
+    | Annotated[Detect, tyro.conf.subcommand("detect")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Import, tyro.conf.subcommand("import")]

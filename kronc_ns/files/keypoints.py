@@ -32,6 +32,8 @@ class Detections:
     """Image path or name as the file gives it -> its M instances of (u, v, confidence); confidence 0: not seen."""
     size: tuple[int, int] | None = None
     """(width, height) of the images, where the file says."""
+    sigma_px: Mapping[str, Float[np.ndarray, "_ j"]] | None = None
+    """Standard deviation of each place along one axis, beside `frames`, where the detector knew it; 0: not seen."""
 
 
 def read_keypoints(path: Path) -> Detections:
@@ -96,18 +98,41 @@ def match_keypoints(
     return rows, note if several else ""
 
 
+def sigma_of(
+    found: Detections, names: tuple[str, ...], rows: Float[np.ndarray, "n j 3"]
+) -> Float[np.ndarray, "n j"] | None:
+    """Standard deviations in pixels of the ``rows`` that `match_keypoints` chose for these names; None if unknown."""
+    if found.sigma_px is None:
+        return None
+    by_file = {PurePosixPath(key).name: key for key in found.frames}
+    sigma = np.zeros(rows.shape[:2])
+    for i, name in enumerate(names):
+        key = name if name in found.frames else by_file.get(PurePosixPath(name).name)
+        for instance, its_own in zip(found.frames[key], found.sigma_px[key], strict=True) if key else ():
+            if np.array_equal(instance, rows[i]):
+                sigma[i] = its_own
+    return sigma
+
+
 def write_keypoints(
-    path: Path, schema: KeypointSchema, size: tuple[int, int], frames: Mapping[str, Float[np.ndarray, "j 3"]]
+    path: Path,
+    schema: KeypointSchema,
+    size: tuple[int, int] | None,
+    frames: Mapping[str, Float[np.ndarray, "j 3"]],
+    sigma_px: Float[np.ndarray, "n j"] | None = None,
 ) -> None:
-    """Write our ``keypoints.json`` (the contract of the scene folder)."""
-    rows = [
+    """Write our ``keypoints.json`` (the contract of the scene folder); ``size`` where all images have the same."""
+    rows: list[dict[str, Any]] = [
         {
             "file_path": name,
             "keypoints": [[round(float(u), 3), round(float(v), 3), round(float(c), 4)] for u, v, c in uvc],
         }
         for name, uvc in frames.items()
     ]
-    write_json(path, {"schema": describe_schema(schema), "width": size[0], "height": size[1], "frames": rows})
+    for row, sigma in zip(rows, sigma_px if sigma_px is not None else (), strict=sigma_px is not None):
+        row["sigma_px"] = [round(float(s), 3) for s in sigma]
+    sides = {} if size is None else {"width": size[0], "height": size[1]}
+    write_json(path, {"schema": describe_schema(schema), **sides, "frames": rows})
 
 
 def _rows(values: Any, schema: KeypointSchema, where: str) -> Float[np.ndarray, "j 3"]:
@@ -166,6 +191,7 @@ def _read_own(path: Path, content: dict[str, Any]) -> Detections:
     if not isinstance(content["frames"], list):
         raise KroncError(f'{path}: expected "frames", a list of objects with "file_path" and "keypoints"')
     frames: dict[str, np.ndarray] = {}
+    sigmas: dict[str, np.ndarray] = {}
     for number, frame in enumerate(content["frames"]):
         if not isinstance(frame, dict) or not {"file_path", "keypoints"} <= frame.keys():
             raise KroncError(f'{path}: frame {number} lacks "file_path" or "keypoints"')
@@ -173,7 +199,19 @@ def _read_own(path: Path, content: dict[str, Any]) -> Detections:
         if name in frames:
             raise KroncError(f"{path}: two frames are called {name}: expected one entry per image")
         frames[name] = _rows(frame["keypoints"], schema, f"{path}, {name}")[None]
-    return Detections(path, schema, frames, size)
+        if "sigma_px" in frame:
+            sigmas[name] = _sigma(frame["sigma_px"], schema, f"{path}, {name}")[None]
+    return Detections(path, schema, frames, size, sigmas if sigmas and sigmas.keys() == frames.keys() else None)
+
+
+def _sigma(values: Any, schema: KeypointSchema, where: str) -> Float[np.ndarray, "j"]:
+    try:
+        sigma = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        sigma = np.zeros(0)
+    if sigma.shape != (len(schema),) or not np.isfinite(sigma).all() or (sigma < 0).any():
+        raise KroncError(f"{where}: sigma_px: expected {len(schema)} numbers of pixels, 0 for a point that is not seen")
+    return sigma
 
 
 def _read_openpifpaf(folder: Path) -> Detections:

@@ -11,8 +11,9 @@ import tyro
 from rich.console import Console
 
 from kronc_ns.capture.depth import depth_estimator, with_depths
-from kronc_ns.capture.detection.choice import DetectorOptions, find_keypoints
+from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.capture.detection.detector import Detector
+from kronc_ns.capture.detection.finding import find_keypoints
 from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, find_frames, prepare_frames
 from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics, read_calibration
 from kronc_ns.capture.masks import find_masks, write_masks
@@ -24,7 +25,7 @@ from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, 
 from kronc_ns.commands.options import SolverOptions
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import fingerprint
-from kronc_ns.files.keypoints import FORMATS, Detections, read_keypoints, write_keypoints
+from kronc_ns.files.keypoints import FORMATS, Detections, read_keypoints, sigma_of, write_keypoints
 from kronc_ns.files.output import claim_output, write_json
 from kronc_ns.files.record import write_solution
 from kronc_ns.files.scene_folder import load_scene, match_keypoints
@@ -40,7 +41,7 @@ from kronc_ns.show.report import write_report
 class KroncToNerfstudio:
     """Process a walk around a car: camera poses from its semantic keypoints.
 
-    The keypoints come from a file or from a --detector. Run without either to get the frames and be told how to go on.
+    The keypoints come from a file, else from a detector; with --detector none you get the frames alone.
     """
 
     data: Path
@@ -48,7 +49,7 @@ class KroncToNerfstudio:
     output_dir: Path
     """New or empty folder, or one that this command wrote; gets nerfstudio's layout and kronc.json."""
     keypoints: Path | None = None
-    """Our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON. Default: those in DATA."""
+    """Our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON. Default: those in DATA, if any."""
     detection: Annotated[DetectorOptions, tyro.conf.arg(name="")] = field(default_factory=DetectorOptions)
     """How keypoints are found, where no file holds them."""
     masks: Path | None = None
@@ -85,12 +86,14 @@ class KroncToNerfstudio:
         """Process; raises `KroncError` for what the user can mend. Returns 3 for a doubtful solution, else 0."""
         config = self.solve.solver_config()
         self._check_options()
-        detector, segmenter = self.detection.make(), self.segmentation.make()
         source = find_source(self.data)
+        given = self.keypoints or source.keypoints
+        detector = self.detection.make(default="builtin" if given is None else "none")
+        segmenter = self.segmentation.make()
         if source.depths is None:  # what is missing is told before the work begins
             depth_estimator(config, self.depth_weights)
         size = check_source(source)
-        found = None if detector else self._read_keypoints(source)
+        found = None if detector else self._read_keypoints(source, given)
         early = None if size is None else self._intrinsics(source, size)
         out = self.output_dir
         settings = (Sampling(self.num_frames, self.fps), self.num_downscales)
@@ -117,7 +120,8 @@ class KroncToNerfstudio:
         if detector is not None:
             found = _detect(detector, frames, masks, out)
         if found is None:
-            raise KroncError(_how_to_go_on(frames, out))
+            print(_how_to_go_on(frames, out))
+            return 0
         note = _write_keypoints(found, frames, intrinsics.camera, masks, out)
 
         scene = load_scene(out)
@@ -153,25 +157,25 @@ class KroncToNerfstudio:
         data, out = self.data.resolve(), self.output_dir.resolve()
         if data == out or out in data.parents:
             raise KroncError(f"--data {self.data} lies in --output-dir {self.output_dir}: choose another output folder")
-        if self.keypoints is not None and self.detection.detector is not None:
+        if self.keypoints is not None and self.detection.detector not in (None, "none"):
             raise KroncError(f"--keypoints {self.keypoints} and --detector {self.detection.detector}: give one of them")
         if self.masks is not None and self.segmentation.segmenter is not None:
             raise KroncError(f"--masks {self.masks} and --segmenter {self.segmentation.segmenter}: give one of them")
         if self.masks is not None and not self.masks.is_dir():
             raise KroncError(f"--masks {self.masks} is no folder: expected one mask image per photo, of the same stem")
 
-    def _read_keypoints(self, source: Source) -> Detections | None:
-        """Detections, or None where a first run without them makes sense."""
-        path = self.keypoints or source.keypoints
-        if path is not None:
-            return read_keypoints(path)
+    def _read_keypoints(self, source: Source, given: Path | None) -> Detections | None:
+        """Detections of a file, or None where frames alone are wanted."""
+        if given is not None:
+            return read_keypoints(given)
         if source.kind == "scene folder":
             raise KroncError(
-                f"{self.data} has no keypoints.json: give --keypoints ({FORMATS}), or find them with --detector"
+                f"{self.data} has no keypoints.json: give --keypoints ({FORMATS}), or find them with --detector builtin"
             )
         if (self.output_dir / "kronc.json").exists():
             raise KroncError(
-                f"{self.output_dir} is solved already: give --keypoints ({FORMATS}) or --detector to solve it anew"
+                f"{self.output_dir} is solved already: give --keypoints ({FORMATS}) or another --detector to solve it "
+                "anew"
             )
         return None
 
@@ -230,7 +234,8 @@ def _write_keypoints(
     if not _covers(names, found):
         names = frames.source_names
     rows, note = match_keypoints(found, names, camera, [out / mask for mask in masks] if masks else None)
-    write_keypoints(target, found.schema, frames.size, dict(zip(frames.names, rows, strict=True)))
+    sigma = sigma_of(found, names, rows)
+    write_keypoints(target, found.schema, frames.size, dict(zip(frames.names, rows, strict=True)), sigma)
     return note
 
 
@@ -251,8 +256,8 @@ def _how_to_go_on(frames: Frames, out: Path) -> str:
     images = out / "images"
     note = f" ({frames.note})" if frames.note else ""
     return (
-        f"{len(frames.names)} frames are ready in {images}{note}, but there are no keypoints: run the same command "
-        f"again with `--detector openpifpaf`, which finds them, or with `--keypoints` ({FORMATS})"
+        f"{len(frames.names)} frames are ready in {images}{note}: for their poses run the same command again without "
+        f"`--detector none`, or with `--keypoints` ({FORMATS})"
     )
 
 

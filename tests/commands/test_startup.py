@@ -46,7 +46,7 @@ def test_the_public_names_know_no_torch():
     assert not imported(code=everything) & {*NEVER, *DRAWN}
 
 
-@pytest.mark.parametrize("command", [[], ["solve"], ["bench"], ["convert-detector"]], ids=" ".join)
+@pytest.mark.parametrize("command", [[], ["solve"], ["bench"], ["detect"], ["convert-detector"]], ids=" ".join)
 def test_help_needs_no_numbers(command):
     assert not imported(*command, "--help") & {"numpy", "jaxtyping", "rich", *NEVER, *DRAWN, *COMPILED}
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints, write_keypoints
+from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints, sigma_of, write_keypoints
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import APOLLOCAR3D_24, APOLLOCAR3D_66, KeypointSchema
 
@@ -28,6 +28,36 @@ def test_own_format_round_trip(tmp_path):
     assert read.size == (480, 270)
     for name, expected in frames.items():
         np.testing.assert_allclose(read.frames[name][0], expected)
+
+
+def test_standard_deviations_round_trip(tmp_path, edit):
+    rng, file = np.random.default_rng(1), tmp_path / "keypoints.json"
+    rows = np.concatenate([rng.uniform(1, 200, (2, 66, 2)), rng.uniform(0.1, 1, (2, 66, 1))], axis=2)
+    sigma = rng.uniform(0, 5, (2, 66))
+    names = ("images/a.png", "images/b.png")
+    write_keypoints(file, APOLLOCAR3D_66, None, dict(zip(names, rows, strict=True)), sigma)
+    found = read_keypoints(tmp_path)
+    assert found.size is None
+    matched, _ = match_keypoints(found, ("new/b.png", "new/a.png"), Camera(400.0, 400.0, 240.0, 135.0, 480, 270))
+    again = sigma_of(found, ("new/b.png", "new/a.png"), matched)
+    assert again is not None
+    assert np.abs(again - sigma[::-1]).max() <= 0.0005001
+    edit(file, lambda content: content["frames"][0].pop("sigma_px"))
+    assert read_keypoints(file).sigma_px is None  # known of all or none
+    for wrong in ([1.0], [-1.0] * 66, ["a"] * 66, [float("nan")] * 66):
+        edit(file, lambda content, wrong=wrong: content["frames"][1].update(sigma_px=wrong))
+        with pytest.raises(KroncError, match=r"images/b\.png: sigma_px: expected 66 numbers"):
+            read_keypoints(file)
+
+
+def test_standard_deviations_follow_the_car_that_was_chosen():
+    cars = np.zeros((2, 66, 3))
+    cars[0, :5] = [[10, 10, 0.9], [12, 10, 0.9], [12, 12, 0.9], [10, 12, 0.9], [11, 11, 0.9]]
+    cars[1, :5] = [[100, 50, 0.9], [300, 50, 0.9], [300, 200, 0.9], [100, 200, 0.9], [200, 100, 0.9]]
+    sigma = np.stack([np.full(66, 1.0), np.full(66, 2.0)])
+    found = Detections(Path("x"), APOLLOCAR3D_66, {"a": cars, "b": cars[:0]}, None, {"a": sigma, "b": sigma[:0]})
+    rows, _ = match_keypoints(found, ("a", "b"), Camera(400.0, 400.0, 240.0, 135.0, 480, 270))
+    assert sigma_of(found, ("a", "b"), rows).tolist() == [[2.0] * 66, [0.0] * 66]
 
 
 def test_own_schema_round_trip(tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from kronc_ns.capture.detection.builtin import detector as builtin
 from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.capture.segmentation.choice import SegmenterOptions
 from kronc_ns.commands.options import SolverOptions
@@ -25,9 +26,11 @@ from kronc_ns.plugin import process_data
 from kronc_ns.plugin.process_data import KroncToNerfstudio
 from kronc_ns.synthetic.folder import write_capture
 from kronc_ns.synthetic.scenes import Capture, default_camera, make_capture
-from tests.capture.detection.dots import Net
+from tests.capture.detection.builtin_net import POINTS, builtin_net, car, draw_cars
+from tests.capture.detection.dots import Net, save
 
 VIEWS = 12
+FRAMES_ONLY = DetectorOptions("none")
 HASTY = "solver: adam\nadam:\n  steps: 3\n"  # too little for anything
 
 
@@ -158,17 +161,17 @@ def test_given_poses_survive_an_interruption(
     assert "as an earlier run left them" in capsys.readouterr().out
 
 
-def test_photos_without_keypoints_say_how_to_go_on(
+def test_photos_without_keypoints_or_detector_say_how_to_go_on(
     scene: Path, tmp_path: Path, config: SolverOptions, capture: Capture, capsys: pytest.CaptureFixture[str]
 ):
     photos, out = scene / "images", tmp_path / "out"
-    options = {"data": photos, "output_dir": out, "focal_length_px": 400.0, "solve": config}
-    assert _status(KroncToNerfstudio(**options)) == 2
-    err = capsys.readouterr().err.strip()
-    assert len(err.splitlines()) == 1
-    assert err.startswith("error: 12 frames are ready in")
-    assert "`--detector openpifpaf`" in err
-    assert "`--keypoints`" in err
+    options = {"data": photos, "output_dir": out, "focal_length_px": 400.0, "solve": config, "detection": FRAMES_ONLY}
+    assert _status(KroncToNerfstudio(**options)) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert printed.out.startswith("12 frames are ready in")
+    assert "without `--detector none`" in printed.out
+    assert "`--keypoints`" in printed.out
     assert (out / MARKER).exists()
     content = json.loads((out / "transforms.json").read_text())
     assert content["fl_x"] == 400.0
@@ -239,11 +242,11 @@ def test_video_in_two_runs(
     video, out = tmp_path / "walk.mp4", tmp_path / "out"
     command = ["ffmpeg", "-v", "error", "-framerate", "6", "-i", str(scene / "images" / "IMG_%d.jpg"), str(video)]
     subprocess.run(command, check=True)
-    options = {"data": video, "output_dir": out, "solve": config}
-    assert _status(KroncToNerfstudio(**options)) == 2
-    err = capsys.readouterr().err.splitlines()
-    assert err[0].startswith("warning: focal length 377 px is an assumed field of view of 65 deg")
-    assert err[1].startswith("error: 12 frames are ready in")
+    options = {"data": video, "output_dir": out, "solve": config, "detection": FRAMES_ONLY}
+    assert _status(KroncToNerfstudio(**options)) == 0
+    printed = capsys.readouterr()
+    assert printed.err.startswith("warning: focal length 377 px is an assumed field of view of 65 deg")
+    assert printed.out.startswith("12 frames are ready in")
     assert len(list((out / "images").iterdir())) == VIEWS
     _write_openpifpaf(tmp_path / "pifpaf", capture, [f"frame_{i:05d}.png" for i in range(1, VIEWS + 1)])
     assert _status(KroncToNerfstudio(keypoints=tmp_path / "pifpaf", **options)) in (0, 3)  # 377 px, in truth 400
@@ -307,7 +310,7 @@ def test_folders_that_are_not_ours_stay_as_they_are(scene: Path, tmp_path: Path,
 
 def test_a_scene_folder_needs_keypoints(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (scene / "keypoints.json").unlink()
-    assert _status(KroncToNerfstudio(data=scene, output_dir=tmp_path / "out")) == 2
+    assert _status(KroncToNerfstudio(data=scene, output_dir=tmp_path / "out", detection=FRAMES_ONLY)) == 2
     assert "has no keypoints.json: give --keypoints" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -368,6 +371,38 @@ def test_a_detector_finds_the_keypoints(
     assert np.abs(load_scene(out).keypoints - capture.keypoints).max() < 2e-3
     assert _status(command) == 0
     assert (tmp_path / "calls").read_text() == f"{VIEWS}\n"  # the second run had nothing left to detect
+
+
+def test_the_builtin_detector_is_the_default(
+    tmp_path: Path, config: SolverOptions, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("KRONC_NS_CACHE", str(tmp_path / "cache"))
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    boxes = [(100.0 + 20 * i, 80.0, 500.0 + 20 * i, 290.0) for i in range(3)]
+    for i, box in enumerate(boxes):
+        save(photos / f"{i}.png", draw_cars((640, 360), box))
+    monkeypatch.setattr(builtin, "WEIGHTS", builtin_net(tmp_path))
+    status = _status(KroncToNerfstudio(data=photos, output_dir=out, focal_length_px=400.0, solve=config))
+    assert status == 3  # a flat car
+    assert "3 of 3 frames with 4 or more" in " ".join(capsys.readouterr().out.split())
+    found = read_keypoints(out)
+    assert found.sigma_px is not None
+    for i, box in enumerate(boxes, start=1):
+        (rows,) = found.frames[f"images/frame_{i:05d}.png"]
+        assert np.abs(rows[list(POINTS), :2] - car(box)).max() < 1
+        assert (found.sigma_px[f"images/frame_{i:05d}.png"][0, list(POINTS)] > 0).all()
+
+
+def test_a_file_of_keypoints_keeps_the_builtin_detector_away(
+    scene: Path, tmp_path: Path, config: SolverOptions, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(builtin, "WEIGHTS", tmp_path / "nowhere.onnx")
+    command = KroncToNerfstudio(data=scene, output_dir=tmp_path / "out", solve=config)
+    assert _status(command) == 0
+    file = Path(shutil.move(scene / "keypoints.json", tmp_path / "kp.json"))
+    assert _status(dataclasses.replace(command, keypoints=file)) == 0
+    assert _status(dataclasses.replace(command, keypoints=file, detection=FRAMES_ONLY)) == 0
+    assert _status(command) == 2  # none: now it is asked for
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,10 @@ class CarDetection:
     """Left, top, right, bottom."""
     score: float
     """Confidence that this is a car, 0 to 1."""
+    sigma_px: Float[np.ndarray, "k"] | None = None
+    """Standard deviation of each place along one axis, where the detector knows it."""
+    turned_deg: int = 0
+    """90, 180 or 270: the car was recognised only after turning the image so far counter-clockwise; no points."""
 
 
 @runtime_checkable

@@ -1,6 +1,7 @@
 """ONNX files and the JSON file beside each that says what the network does not."""
 
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +15,7 @@ from kronc_ns.files.keypoints import read_schema
 from kronc_ns.files.output import read_json
 from kronc_ns.keypoints.schema import KeypointSchema, schema_of_count
 
-EXTRA = "pip install 'kronc-ns[onnx]'"
+INSTALL = "pip install onnxruntime"
 
 
 @dataclass(frozen=True)
@@ -78,32 +79,39 @@ class OnnxModel:
 
 
 def open_model(path: Path) -> OnnxModel:
-    """Load an ONNX file with onnxruntime, on the GPU where its package for GPUs is installed."""
-    try:
-        import onnxruntime
-    except ImportError:
-        raise KroncError(f"{path} needs onnxruntime, which is not installed: {EXTRA}") from None
-    if not path.is_file():
-        raise KroncError(f"{path} does not exist: expected the ONNX file of a keypoint detector")
+    """Load an ONNX file of a detector that takes planes [1, 3, h, w]."""
+    session = open_session(path)
     card = path.with_suffix(".json")
     sidecar = read_json(card) if card.is_file() else {}
     if not isinstance(sidecar, dict):
         raise KroncError(f"{card} is no JSON object: expected what `kronc convert-detector` writes beside an ONNX file")
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3  # its warnings about graphs help no user
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave idle cores to others
-    wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
-    providers = [name for name in wanted if name in onnxruntime.get_available_providers()]
-    try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:  # onnxruntime's own exceptions share no base class
-        reason = _first_line(error)
-        raise KroncError(f"{path} is no ONNX file that onnxruntime can run ({reason}): export it anew") from None
     inputs = session.get_inputs()
     if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].shape[1] not in (3, "channels"):
         shapes = ", ".join(str(i.shape) for i in inputs)
         raise KroncError(f"{path} takes {shapes}: expected a detector of one RGB image, [1, 3, height, width]")
     return OnnxModel(path, session, sidecar)
+
+
+def open_session(path: Path) -> Any:
+    """``onnxruntime.InferenceSession`` of a file, on the GPU where onnxruntime's package for GPUs is installed."""
+    try:
+        import onnxruntime
+    except ImportError:
+        raise KroncError(f"{path} needs onnxruntime, which is not installed: {INSTALL}") from None
+    if not path.is_file():
+        raise KroncError(f"{path} does not exist: expected the ONNX file of a keypoint detector")
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # its warnings about graphs help no user
+    # by itself it counts physical cores, of which a share of a machine may have one
+    options.intra_op_num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave idle cores to others
+    wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
+    providers = [name for name in wanted if name in onnxruntime.get_available_providers()]
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=providers)
+    except Exception as error:  # onnxruntime's own exceptions share no base class
+        reason = _first_line(error)
+        raise KroncError(f"{path} is no ONNX file that onnxruntime can run ({reason}): export it anew") from None
 
 
 def file_sha256(path: Path) -> str:

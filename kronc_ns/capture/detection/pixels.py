@@ -33,11 +33,15 @@ class Placement:
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """The image as it is stored; where it is transparent, white shines through."""
-    image = load_image(path)
+    return np.array(on_white(load_image(path)))
+
+
+def on_white(image: Image.Image) -> Image.Image:
+    """The image as RGB; where it is transparent, white shines through."""
     if _is_transparent(image):
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return np.array(image.convert("RGB"))
+    return image.convert("RGB")
 
 
 def is_transparent(path: Path) -> bool:
@@ -86,11 +90,15 @@ def letterbox(
 
 
 def crop(
-    rgb: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, "4"], size: tuple[int, int], padding: float
+    rgb: UInt8[np.ndarray, "h w 3"],
+    box: Float[np.ndarray, "4"],
+    size: tuple[int, int],
+    padding: float,
+    fill: int = 0,
 ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], Placement]:
     """The box (left, top, right, bottom), widened to the shape of ``size`` and by ``padding``, drawn in that size.
 
-    What lies outside the image is black.
+    What lies outside the image is black, or grey of value ``fill``.
     """
     import cv2
 
@@ -105,7 +113,7 @@ def crop(
     scale = factor / np.array(placement.scale)
     shift = offset + 0.5 * scale - 0.5
     matrix = np.array([[scale[0], 0.0, shift[0]], [0.0, scale[1], shift[1]]])
-    drawn = cv2.warpAffine(inner, matrix, size, flags=cv2.INTER_LINEAR)
+    drawn = cv2.warpAffine(inner, matrix, size, flags=cv2.INTER_LINEAR, borderValue=(fill, fill, fill))
     return drawn.astype(np.uint8), Placement((factor, factor), (float(offset[0]), float(offset[1])))
 
 

@@ -46,21 +46,27 @@ def _file(detector: Detector, image: CarImage) -> Path:
 
 
 def _as_json(car: CarDetection) -> dict[str, Any]:
+    sigma = {} if car.sigma_px is None else {"sigma_px": np.where(car.confidence > 0, car.sigma_px, 0.0).tolist()}
     return {
         "uv": np.where(car.confidence[:, None] > 0, car.uv, 0.0).tolist(),
         "confidence": car.confidence.tolist(),
         "bbox": car.bbox.tolist(),
         "score": car.score,
+        "turned_deg": car.turned_deg,
+        **sigma,
     }
 
 
 def _read(file: Path, count: int) -> list[CarDetection] | None:
     """Detections of an earlier run; what cannot be read counts as absent, since it can be made anew."""
     try:
-        cars = [
-            CarDetection(np.array(c["uv"]), np.array(c["confidence"]), np.array(c["bbox"]), float(c["score"]))
-            for c in read_json(file)
-        ]
+        cars = [_from_json(content) for content in read_json(file)]
     except (KroncError, KeyError, TypeError, ValueError, json.JSONDecodeError):
         return None
     return cars if all(car.uv.shape == (count, 2) for car in cars) else None
+
+
+def _from_json(content: dict[str, Any]) -> CarDetection:
+    sigma = np.array(content["sigma_px"], dtype=np.float64) if "sigma_px" in content else None
+    uv, confidence, bbox = (np.array(content[key], dtype=np.float64) for key in ("uv", "confidence", "bbox"))
+    return CarDetection(uv, confidence, bbox, float(content["score"]), sigma, int(content.get("turned_deg", 0)))

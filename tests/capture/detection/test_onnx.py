@@ -205,8 +205,8 @@ def test_files_that_are_no_detector_are_named(tmp_path: Path):
         CompositeFieldDetector(file)
 
 
-def test_without_onnxruntime_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_onnxruntime_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     file = yolo_net(tmp_path / "net.onnx")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(KroncError, match=r"needs onnxruntime, .*pip install 'kronc-ns\[onnx\]'"):
+    with pytest.raises(KroncError, match=r"needs onnxruntime, .*pip install onnxruntime"):
         YoloPoseDetector(file)

@@ -1,13 +1,14 @@
 """What is detected once is not detected again, whatever interrupts the work."""
 
 from collections.abc import Generator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from kronc_ns.capture.detection.choice import find_keypoints
 from kronc_ns.capture.detection.detector import CarDetection, CarImage
+from kronc_ns.capture.detection.finding import find_keypoints
 from kronc_ns.capture.detection.store import detect_all
 from kronc_ns.errors import KroncError
 from kronc_ns.keypoints.schema import schema_of_count
@@ -102,6 +103,26 @@ def test_masks_count_where_they_matter(tmp_path: Path):
         second = Counting(identity=identity, uses_masks=uses_masks)
         detect_all(second, masked)
         assert len(second.asked) == repeated
+
+
+def test_all_that_a_detector_says_is_kept(tmp_path: Path):
+    class Sure(Counting):
+        def detect(self, images: Sequence[CarImage]) -> Generator[list[CarDetection], None, None]:
+            for number, (car,) in enumerate(super().detect(images)):
+                yield [replace(car, sigma_px=np.array([1.5, np.nan, 2.0, 3.0]), turned_deg=90 * number)]
+
+    images = images_of(tmp_path, [1, 2])
+    detect_all(Sure(), images)
+    again = Sure()
+    (first,), (second,) = detect_all(again, images)
+    assert again.asked == []
+    assert first.sigma_px is not None
+    assert first.sigma_px.tolist() == [1.5, 0.0, 2.0, 3.0]
+    assert (first.turned_deg, second.turned_deg) == (0, 90)
+    frames = find_keypoints(Sure(), tmp_path, ["images/0.png", "images/1.png"], SIZE)
+    assert frames.sigma_px is not None
+    assert frames.sigma_px["images/0.png"].tolist() == [[1.5, 0.0, 0.0, 0.0]]
+    assert frames.frames["images/1.png"].shape == (0, 4, 3)
 
 
 def test_damaged_entries_are_made_anew(tmp_path: Path):

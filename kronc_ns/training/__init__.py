@@ -1,0 +1,1 @@
+"""How the builtin keypoint detector is made: cars, pictures of them, a network, its training (extra ``train``)."""
