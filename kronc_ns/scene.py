@@ -1,6 +1,6 @@
 """The scene: everything a solver may know about a capture."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import KeypointSchema
+
+_SIGMA_LIMITS = (0.5, 3.0)  # of the usual one
 
 
 @dataclass(frozen=True)
@@ -29,12 +31,19 @@ class Scene:
     """``mask_path`` of each view, or None."""
     notes: tuple[str, ...] = ()
     """What loading decided that the user may want to know."""
+    sigma_px: Float[np.ndarray, "n j"] | None = None
+    """Standard deviation of each place along one axis, where the detector knew it; 0 where nothing was found."""
 
     def __post_init__(self) -> None:
         if self.keypoints.shape != (len(self.names), len(self.schema), 3):
             raise KroncError(
                 f"keypoints have shape {tuple(self.keypoints.shape)}: "
                 f"expected ({len(self.names)}, {len(self.schema)}, 3)"
+            )
+
+        if self.sigma_px is not None and self.sigma_px.shape != self.keypoints.shape[:2]:
+            raise KroncError(
+                f"sigma_px has shape {tuple(self.sigma_px.shape)}: expected {tuple(self.keypoints.shape[:2])}"
             )
 
     def __len__(self) -> int:
@@ -49,6 +58,28 @@ class Scene:
     def visibility(self) -> Float[np.ndarray, "n j"]:
         """The paper's m: 1 where a keypoint was found, else 0."""
         return self.seen.astype(np.float64)
+
+    @cached_property
+    def precision(self) -> Float[np.ndarray, "n j"]:
+        """How much each measurement counts beside the others: confidence over variance; 0 where nothing was found.
+
+        What a detector says of its noise is believed within limits: no point counts for dozens of others.
+        """
+        confidence = self.keypoints[..., 2]
+        if self.sigma_px is None or not self.seen.any():
+            return confidence
+        usual = max(float(np.median(self.sigma_px[self.seen])), 1e-9)
+        relative = np.clip(self.sigma_px / usual, *_SIGMA_LIMITS)
+        return np.where(self.seen, confidence / relative**2, 0.0)
+
+    def with_sides_swapped(self, swapped: Bool[np.ndarray, "n"]) -> "Scene":
+        """The scene with left and right of these views exchanged."""
+        flip = list(self.schema.flip)
+        keypoints = np.where(swapped[:, None, None], self.keypoints[:, flip], self.keypoints)
+        sigma = self.sigma_px
+        if sigma is not None:
+            sigma = np.where(swapped[:, None], sigma[:, flip], sigma)
+        return replace(self, keypoints=keypoints, sigma_px=sigma)
 
     @cached_property
     def uv(self) -> Float[np.ndarray, "n j 2"]:

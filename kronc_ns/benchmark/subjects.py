@@ -107,6 +107,7 @@ def chosen_views(scene: Scene, keep: Bool[np.ndarray, "n"]) -> Scene:
         scene,
         names=names(scene.names),
         keypoints=scene.keypoints[keep],
+        sigma_px=None if scene.sigma_px is None else scene.sigma_px[keep],
         given_c2w=None if scene.given_c2w is None else scene.given_c2w[keep],
         given_depths=None if scene.given_depths is None else scene.given_depths[keep],
         masks=None if scene.masks is None else names(scene.masks),

@@ -16,7 +16,7 @@ from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import Progress, solve_scene
 from kronc_ns.scene import Scene
 
-_FORMAT = 6  # raised whenever the same input and options give another solution
+_FORMAT = 7  # raised whenever the same input and options give another solution
 
 
 def cache_folder() -> Path:
@@ -33,7 +33,7 @@ def fingerprint(scene: Scene, config: KroncConfig) -> str:
     names = [PurePosixPath(name).name for name in scene.names]
     header = json.dumps([_FORMAT, names, asdict(scene.camera), describe_schema(scene.schema), settings], sort_keys=True)
     digest = hashlib.sha256(header.encode())
-    for array in (scene.keypoints, given, depths):
+    for array in (scene.keypoints, scene.sigma_px, given, depths):
         digest.update(b"-" if array is None else np.ascontiguousarray(array, dtype=np.float64).tobytes())
     return digest.hexdigest()
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 import kronc_ns
 from kronc_ns.errors import KroncError
-from kronc_ns.files.keypoints import match_keypoints, read_keypoints, write_keypoints
+from kronc_ns.files.keypoints import match_keypoints, read_keypoints, sigma_of, write_keypoints
 from kronc_ns.files.output import read_json, relative_path, release_output, write_json
 from kronc_ns.files.ply import write_points
 from kronc_ns.files.provenance import provenance
@@ -40,7 +40,8 @@ def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, i
     write_json(folder / "transforms.json", content)
     if folder.resolve() != data.resolve():  # where they stand already
         rows = dict(zip(names, scene.keypoints, strict=True))
-        write_keypoints(folder / "keypoints.json", scene.schema, (scene.camera.width, scene.camera.height), rows)
+        size = (scene.camera.width, scene.camera.height)
+        write_keypoints(folder / "keypoints.json", scene.schema, size, rows, scene.sigma_px)
     report = {
         **solution_dict(solution),
         "keypoint_schema": scene.schema.name,
@@ -120,9 +121,9 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
     found = read_keypoints(folder / "keypoints.json")
     if len(points) != len(found.schema):
         raise KroncError(f"{file} has {len(points)} points, keypoints.json {len(found.schema)}: solve again")
-    keypoints = match_keypoints(found, names, camera)[0]
-    swapped = np.array([view.swapped for view in views])
-    keypoints = np.where(swapped[:, None, None], found.schema.mirrored(keypoints), keypoints)
+    rows = match_keypoints(found, names, camera)[0]
+    detected = Scene(names, camera, found.schema, rows, sigma_px=sigma_of(found, names, rows))
+    scene = detected.with_sides_swapped(np.array([view.swapped for view in views]))
     solved = np.array([view.status is ViewStatus.SOLVED for view in views])
     depths = camera_z(c2w, points)
     solution = Solution(
@@ -131,14 +132,14 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         camera=camera,
         c2w=c2w,
         points=points,
-        depths=np.where((keypoints[..., 2] > 0) & solved[:, None], depths, math.nan),
+        depths=np.where(scene.seen & solved[:, None], depths, math.nan),
         views=views,
         initial_c2w=initial,
         history=history,
         path=path,
         **overall,
     )
-    return Scene(names, camera, found.schema, keypoints), solution
+    return scene, solution
 
 
 def solved_points(folder: Path) -> Float[np.ndarray, "j 3"]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from kronc_ns.errors import KroncError
 from kronc_ns.files.images import depth_under, read_depth
-from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints
+from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints, sigma_of
 from kronc_ns.files.output import read_json
 from kronc_ns.files.record import left_out_views
 from kronc_ns.files.transforms import camera_and_frames, given_poses
@@ -51,6 +51,7 @@ def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
         camera=camera,
         schema=found.schema,
         keypoints=rows,
+        sigma_px=sigma_of(found, names, rows),
         given_c2w=None if is_solution else given_poses(frames, file),
         given_depths=_given_depths(folder, frames, rows, camera),
         masks=masks if any(masks) else None,

@@ -138,8 +138,8 @@ def problem_of(found: Hypothesis, refine: tuple[Intrinsic, ...] = (), with_prior
     m = scene.visibility * found.used[:, None]
     if prior is None:
         m = m * (m.sum(0) >= 2)  # without a prior a single view says nothing of a point
-    confident = m * scene.keypoints[..., 2]
-    weight = confident / max(confident.sum(), 1e-9) * m.sum()
+    precise = m * scene.precision
+    weight = precise / max(precise.sum(), 1e-9) * m.sum()
     return Problem(scene.uv - (camera.cx, camera.cy), weight, (camera.fx, camera.fy), prior, refine=refine)
 
 

@@ -87,7 +87,7 @@ def _relocated(attempt: Attempt, suspect: Bool[np.ndarray, "n"]) -> Hypothesis |
         present[posed] = unexplained(single_views(scene, points, posed, sigma), invert(found.c2w[posed]))
     misfit = _misfits(attempt)
     c2w, cost, swapped = locate_views(scene, points, suspect & misfit, sigma)
-    mirror = replace(scene, keypoints=scene.schema.mirrored(scene.keypoints))
+    mirror = scene.with_sides_swapped(np.ones_like(suspect))
     fitting = suspect & ~misfit
     if fitting.any():
         exchanged = locate(single_views(mirror, points, fitting, sigma))
@@ -98,10 +98,9 @@ def _relocated(attempt: Attempt, suspect: Bool[np.ndarray, "n"]) -> Hypothesis |
     if not better.any() and np.array_equal(used, found.used):
         return None
     swapped &= better
-    keypoints = np.where(swapped[:, None, None], mirror.keypoints, scene.keypoints)
     return replace(
         found,
-        scene=replace(scene, keypoints=keypoints),
+        scene=scene.with_sides_swapped(swapped),
         c2w=np.where(better[:, None, None], c2w, found.c2w),
         used=used,
         swapped=found.swapped ^ swapped,

@@ -111,8 +111,7 @@ def start_from_template(scene: Scene) -> Hypothesis:
     assert template is not None
     used = usable_views(scene)
     c2w, cost, swapped = locate_views(scene, template.mean, used, None)
-    keypoints = np.where(swapped[:, None, None], scene.schema.mirrored(scene.keypoints), scene.keypoints)
-    scene = replace(scene, keypoints=keypoints)
+    scene = scene.with_sides_swapped(swapped)
     return Hypothesis("template", "template", scene, c2w, template.mean, used & (cost < LOST), swapped)
 
 

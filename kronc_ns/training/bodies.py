@@ -10,7 +10,7 @@ import numpy as np
 from kronc_ns.errors import KroncError
 from kronc_ns.training.body import Body
 from kronc_ns.training.decals import painted
-from kronc_ns.training.deformation import Proportions, deform
+from kronc_ns.training.deformation import Proportions, deform, refined
 from kronc_ns.training.labelling import read_labels
 from kronc_ns.training.meshes import load_textured_mesh
 from kronc_ns.training.procedural import draw_procedural
@@ -20,7 +20,7 @@ WITH_KEYPOINTS = ("tesla_model3", "md_280zx", "md_beetle")
 """Cars of the other folder that may be used: CC-BY, keypoints beside them."""
 _TWO_DOORS = ("md_280zx", "md_beetle")
 _REAR_DOORS = [16, 17, 18, 19, 38, 39, 40, 41]
-_PROCEDURAL = 0.2  # share of drawn bodies
+_PROCEDURAL = 0.35  # share of drawn bodies
 # modern cars are what is photographed most: shares of the meshes, others 1
 _SHARES = {
     "tesla_model3": 2.0, "jme_hatchback": 2.0, "chrono_audi": 1.6, "chrono_sedan": 1.6, "gazebo_prius": 1.6,
@@ -44,7 +44,7 @@ def load_garage(cars_train: Path, cars: Path | None) -> list[Model]:
         file = cars_train / labels.stem / "car.glb"
         if not file.is_file():
             continue
-        mesh = load_textured_mesh(file)
+        mesh = refined(load_textured_mesh(file))
         points = read_labels(labels, mesh.geometry()).points
         draw = json.loads(labels.read_text()).get("draw", [])
         models.append(Model(Body(labels.stem, mesh, points), tuple(draw)))
@@ -60,7 +60,7 @@ def labelled_body(folder: Path) -> Body:
     points = np.array(json.loads((folder / "keypoints3d.json").read_text())["keypoints"], dtype=np.float64)
     if folder.name in _TWO_DOORS:
         points[_REAR_DOORS] = np.nan
-    return Body(folder.name, load_textured_mesh(folder / "car.glb"), points)
+    return Body(folder.name, refined(load_textured_mesh(folder / "car.glb")), points)
 
 
 def draw_body(rng: np.random.Generator, garage: Sequence[Model]) -> Body:

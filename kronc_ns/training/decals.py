@@ -6,11 +6,12 @@ from typing import Literal, TypeAlias
 import cv2
 import numpy as np
 
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.training.body import Body, Decal
 
-Side: TypeAlias = Literal["left", "right", "front", "rear"]
+Side: TypeAlias = Literal["left", "right", "front", "rear", "top"]
 METRES_PER_TEXEL = 0.004
-_AXES = {"left": (0, 2), "right": (0, 2), "front": (1, 2), "rear": (1, 2)}
+_AXES: dict[Side, tuple[int, int]] = {"left": (0, 2), "right": (0, 2), "front": (1, 2), "rear": (1, 2), "top": (0, 1)}
 _SKIN = ("paint", "body", "trim", "primary")  # what seams and stickers are painted on
 _LETTERS = "ABCDEFGHJKLMNPRSTUVWXYZ0123456789"
 
@@ -42,21 +43,22 @@ class _Canvas:
         radius = round(16 * radius_m / METRES_PER_TEXEL)
         cv2.circle(self.image, (int(centre[0]), int(centre[1])), radius, (*rgb, 255), -1, cv2.LINE_AA, 4)
 
-    def text(self, at: np.ndarray, words: str, height_m: float, rgb: Sequence[int], mirrored: bool) -> None:
-        """Letters from a lower left corner; ``mirrored`` where the first axis runs from right to left for a viewer."""
-        scale = height_m / METRES_PER_TEXEL / 22
-        (width, height), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_DUPLEX, scale, max(1, round(2 * scale)))
-        stamp = np.zeros((height + 6, width + 4), np.uint8)
-        cv2.putText(
-            stamp, words, (2, height + 2), cv2.FONT_HERSHEY_DUPLEX, scale, 255, max(1, round(2 * scale)), cv2.LINE_AA
-        )
-        stamp = stamp[:, ::-1] if mirrored else stamp
+    def text(self, at: np.ndarray, words: str, size_m: tuple[float, float], rgb: Sequence[int]) -> None:
+        """Letters from a lower left corner, at most so wide and high, readable from outside."""
+        width, height = (max(4, round(v / METRES_PER_TEXEL)) for v in size_m)
+        (wide, high), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_DUPLEX, 2.0, 4)
+        stamp = np.zeros((high + 12, wide + 8), np.uint8)
+        cv2.putText(stamp, words, (4, high + 6), cv2.FONT_HERSHEY_DUPLEX, 2.0, (255,), 4, cv2.LINE_AA)
+        width = min(width, round(1.1 * height * wide / high))
+        stamp = cv2.resize(stamp, (width, height), interpolation=cv2.INTER_AREA)
+        stamp = stamp[:, ::-1] if self.side in ("left", "rear") else stamp
         column, row = self.texels(at[None])[0] // 16
-        top = row - stamp.shape[0]
-        if top < 0 or column < 0 or row > self.image.shape[0] or column + stamp.shape[1] > self.image.shape[1]:
+        top = row - height
+        if top < 0 or column < 0 or row > self.image.shape[0] or column + width > self.image.shape[1]:
             return
-        patch = self.image[top:row, column : column + stamp.shape[1]]
-        patch[..., :3] = np.where(stamp[..., None] > 0, np.array(rgb, np.uint8), patch[..., :3])
+        patch = self.image[top:row, column : column + width]
+        share = stamp[..., None] / 255
+        patch[..., :3] = (patch[..., :3] * (1 - share) + np.array(rgb) * share).astype(np.uint8)
         patch[..., 3] = np.maximum(patch[..., 3], stamp)
 
     def decal(self, surfaces: tuple[str, ...] | None) -> Decal:
@@ -95,19 +97,22 @@ def painted(body: Body, draw: Sequence[str], rng: np.random.Generator) -> Body:
             plates.append(plate.decal(None))
         elif f"{side}_plate" in draw:
             keypoints[corners] = np.nan
+    if "bonnet" in draw:
+        canvas = _Canvas(body, "top")
+        _paint_bonnet(canvas, keypoints[:, :2], seam, rng)
+        decals.append(canvas.decal(skin))
     return Body(body.name, body.mesh, keypoints, (*body.decals, *decals, *plates))
 
 
 def _mirror() -> list[int]:
-    from kronc_ns.keypoints.schema import APOLLOCAR3D_66
-
     return list(APOLLOCAR3D_66.flip)
 
 
-def _rounded(points: np.ndarray) -> np.ndarray:
-    """A polygon's corners cut once (Chaikin), as seams are drawn."""
+def _rounded(points: np.ndarray, radius_m: float = 0.03) -> np.ndarray:
+    """A closed polygon whose corners are cut, as seams are drawn."""
     ahead = np.roll(points, -1, axis=0)
-    cut = np.stack([0.85 * points + 0.15 * ahead, 0.15 * points + 0.85 * ahead], axis=1).reshape(-1, 2)
+    share = np.clip(radius_m / np.maximum(np.linalg.norm(ahead - points, axis=1, keepdims=True), 1e-6), 0, 0.4)
+    cut = np.stack([points + share * (ahead - points), ahead - share * (ahead - points)], axis=1).reshape(-1, 2)
     return np.concatenate([cut, cut[:1]])
 
 
@@ -116,13 +121,17 @@ def _paint_side(
 ) -> None:
     """Seen along y; ``p`` in the order of the left side."""
     width = float(rng.uniform(0.004, 0.010))
+    if rng.uniform() < 0.15:  # black arches
+        rgb, grow = (int(rng.integers(15, 60)),) * 3, rng.uniform(1.25, 1.4)
+        for hub in (7, 20):
+            canvas.disc(p[hub], grow * p[hub, 1], rgb)
     if rng.uniform() < 0.2 and np.isfinite(p[[6, 10, 15, 21]]).all():  # black cladding along the sill
         low, thick = min(p[10, 1], p[15, 1]) - 0.15, rng.uniform(0.1, 0.22)
         sill = np.array([[p[6, 0], low], [p[21, 0], low], [p[21, 0], low + thick], [p[6, 0], low + thick]])
         canvas.fill(sill, tuple(int(v) for v in np.full(3, rng.integers(10, 60))))
-    if rng.uniform() < 0.2:  # moulding
+    if rng.uniform() < 0.15:  # moulding
         height = rng.uniform(0.3, 0.75) * (p[12, 1] - p[10, 1]) + p[10, 1]
-        rgb = tuple(int(v) for v in np.full(3, rng.choice([20, 60, 200])))
+        rgb = tuple(int(v) for v in np.full(3, rng.choice([20, 35, 60, 200])))
         canvas.line(
             np.array([[p[10, 0], height], [p[21, 0], height + rng.uniform(-0.05, 0.1)]]), rgb, rng.uniform(0.01, 0.06)
         )
@@ -136,20 +145,15 @@ def _paint_side(
         shade = int(rng.choice([15, 40, 120, 220]))
         canvas.line(p[[front, rear]] - [0, 0.012], (10, 10, 10), 0.03)
         canvas.line(p[[front, rear]], (shade, shade, shade), 0.022)
-    if rng.uniform() < 0.5:  # fuel cap
-        at = p[16] if np.isfinite(p[16]).all() else p[12] - [0.9, 0]
-        square = at + np.array([[-0.45, -0.05], [-0.62, -0.05], [-0.62, -0.21], [-0.45, -0.21]])
+    if rng.uniform() < 0.35:  # fuel cap
+        at = np.array([p[20, 0] - rng.uniform(-0.05, 0.3), p[12, 1] - rng.uniform(0.06, 0.14)])
+        square = at + np.array([[0.085, 0], [-0.085, 0], [-0.085, -0.16], [0.085, -0.16]])
         canvas.line(_rounded(square), seam, width)
     if rng.uniform() < 0.06:  # lettering
         words = "".join(rng.choice(list(_LETTERS), int(rng.integers(3, 9))))
         rgb = tuple(int(v) for v in rng.integers(0, 255, 3))
-        canvas.text(
-            p[15] + [rng.uniform(-0.5, 0.1), rng.uniform(0.1, 0.3)],
-            words,
-            rng.uniform(0.06, 0.25),
-            rgb,
-            canvas.side == "left",
-        )
+        size = (rng.uniform(0.3, 1.0), rng.uniform(0.06, 0.25))
+        canvas.text(p[15] + [rng.uniform(-0.5, 0.1), rng.uniform(0.1, 0.3)], words, size, rgb)
 
 
 def _paint_front(
@@ -168,7 +172,7 @@ def _paint_front(
             canvas.line(np.array([[-0.93 * half, height], [0.93 * half, height]]), (bright, bright, bright), 0.008)
         canvas.disc(np.array([0.0, (top + bottom) / 2]), rng.uniform(0.03, 0.07), (190, 190, 195))
     if rng.uniform() < 0.3 and np.isfinite(p[5]).all():
-        half, height = rng.uniform(0.4, 0.9) * p[5, 0], p[5, 1] - rng.uniform(-0.05, 0.05)
+        half, height = (rng.uniform(0.4, 0.9) * p[5, 0], p[5, 1] - rng.uniform(-0.05, 0.05))
         shape = np.array([[-half, height], [half, height], [0.85 * half, height - 0.12], [-0.85 * half, height - 0.12]])
         canvas.fill(shape, (15, 15, 15))
     for flip in (False, True):
@@ -187,6 +191,18 @@ def _paint_front(
             canvas.disc(recess.mean(0), 0.035, (150, 155, 160))
     if rng.uniform() < 0.3:
         canvas.line(np.array([[-inner, p[0, 1] + 0.02], [inner, p[0, 1] + 0.02]]), seam, 0.008)
+
+
+def _paint_bonnet(canvas: _Canvas, p: np.ndarray, seam: tuple[int, ...], rng: np.random.Generator) -> None:
+    """Seen from above: the seams from the lamps to the foot of the windscreen."""
+    inset, bow = rng.uniform(0.02, 0.10), rng.uniform(0.0, 0.08)
+    for order in (list(range(66)), _mirror()):
+        lamp, door = p[order][0], p[order][9]
+        side = np.sign(lamp[1])
+        foot = np.array([door[0] + 0.12, door[1] - side * (0.06 + inset)])
+        front = np.array([lamp[0] - 0.02, lamp[1]])
+        bend = np.array([0.5 * (foot[0] + lamp[0]) + 0.1, foot[1] - side * 0.02])
+        canvas.line(np.array([front, 0.6 * bend + 0.4 * front + [0, side * bow], bend, foot]), seam, 0.006)
 
 
 def _paint_rear(
@@ -210,7 +226,7 @@ def _paint_rear(
         canvas.line(_rounded(lid), seam, rng.uniform(0.005, 0.01))
     if rng.uniform() < 0.3:
         words = "".join(rng.choice(list(_LETTERS), int(rng.integers(2, 6))))
-        canvas.text(p[27] + [-0.3, 0.12], words, rng.uniform(0.04, 0.07), (200, 200, 205), canvas.side == "rear")
+        canvas.text(p[27] + [-0.3, 0.12], words, (0.3, rng.uniform(0.04, 0.07)), (200, 200, 205))
 
 
 def _paint_plate(canvas: _Canvas, corners: np.ndarray, side: Side, rng: np.random.Generator) -> None:
@@ -224,16 +240,14 @@ def _paint_plate(canvas: _Canvas, corners: np.ndarray, side: Side, rng: np.rando
     inner = middle + np.array([0.97, 0.9]) * (corners - middle)
     canvas.fill(inner, ground)
     low, high = inner.min(0), inner.max(0)
+    left, right = low[0], high[0]
+    if rng.uniform() < 0.4:  # the blue strip of Europe, on the reader's left
+        edge = 0.08 * (right - left)
+        strip = (left, left + edge) if side == "front" else (right - edge, right)
+        canvas.fill(
+            np.array([[strip[0], low[1]], [strip[1], low[1]], [strip[1], high[1]], [strip[0], high[1]]]), (25, 55, 150)
+        )
+        left, right = (left + edge, right) if side == "front" else (left, right - edge)
     words = "".join(rng.choice(list(_LETTERS), int(rng.integers(5, 9))))
-    height = 0.62 * (high[1] - low[1])
-    if rng.uniform() < 0.4:
-        edge = 0.08 * (high[0] - low[0])
-        left, right = (low[0], low[0] + edge) if side == "front" else (high[0] - edge, high[0])
-        canvas.fill(np.array([[left, low[1]], [right, low[1]], [right, high[1]], [left, high[1]]]), (25, 55, 150))
-    canvas.text(
-        np.array([low[0] + 0.1 * (high[0] - low[0]), low[1] + 0.15 * (high[1] - low[1])]),
-        words,
-        height,
-        ink,
-        side == "rear",
-    )
+    size = (0.9 * (right - left), rng.uniform(0.5, 0.72) * (high[1] - low[1]))
+    canvas.text(np.array([left + 0.05 * (right - left), low[1] + 0.16 * (high[1] - low[1])]), words, size, ink)

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.training.body import Body
+from kronc_ns.training.meshes import TexturedMesh
 
 _FRONT_WHEEL, _REAR_WHEEL = 7, 20  # keypoints of the left side
 _BELT = (9, 12)  # keypoints on the belt line
@@ -34,6 +35,8 @@ class Proportions:
     """Height of the front end above the bumper."""
     tail_m: float = 0.0
     """The same of the rear end."""
+    cabin_m: float = 0.0
+    """Shift of the cabin and the doors forwards, the wheels staying."""
     rake: float = 0.0
     """Shift of the cabin backwards per height above the belt."""
     lean: float = 0.0
@@ -58,6 +61,7 @@ class Proportions:
             float(np.clip(rng.normal(0.01, 0.03), -0.05, 0.1)),
             float(rng.normal(0, 0.035)),
             float(rng.normal(0, 0.045)),
+            float(np.clip(rng.normal(0, 0.05), -0.1, 0.1)),
             float(rng.normal(0, 0.10)),
             float(rng.normal(0, 0.05)),
         )
@@ -68,10 +72,12 @@ def deform(body: Body, to: Proportions) -> Body:
     mesh = body.mesh
     front, rear = body.keypoints[_FRONT_WHEEL], body.keypoints[_REAR_WHEEL]
     names = np.array([s.name.lower() for s in mesh.surfaces])
-    is_wheel = np.array([name.startswith(("tyre", "tire", "rim", "wheel", "w_")) for name in names])
+    is_wheel = np.array([name.startswith(("tyre", "tire", "rim", "wheel")) for name in names])  # not "trim", "primary"
     of_wheel = np.zeros(len(mesh.vertices), dtype=bool)
     of_wheel[mesh.faces[is_wheel[mesh.surface]].ravel()] = True
-    of_wheel |= _within_wheels(mesh.vertices, front, rear)
+    of_wheel &= _within_wheels(mesh.vertices, front, rear, 1.15)  # a spare wheel belongs to the body
+    # where no name tells, everything as far out as the tread is taken to be wheel
+    of_wheel |= _within_wheels(mesh.vertices, front, rear, 0.93 if is_wheel.any() else 1.005)
     move = _body_map(body, to)
     wheel_map = _wheel_map(front, rear, to, move)
 
@@ -87,13 +93,34 @@ def deform(body: Body, to: Proportions) -> Body:
     return replace(body, mesh=moved, keypoints=keypoints + shift)
 
 
+def refined(mesh: TexturedMesh, longest_m: float = 0.12) -> TexturedMesh:
+    """The same surface without long edges: bent, large triangles would let what lies behind them through."""
+    vertices, normals, uv = mesh.vertices, mesh.normals, mesh.uv
+    faces, surface = mesh.faces.copy(), mesh.surface
+    check = np.arange(len(faces))
+    while len(check):
+        corners = vertices[faces[check]]
+        length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+        long = length.max(1) > longest_m
+        check, edge = check[long], length.argmax(1)[long]
+        a, b, c = (faces[check, (edge + k) % 3] for k in range(3))
+        middle = len(vertices) + np.arange(len(check))
+        vertices, normals, uv = (np.concatenate([v, (v[a] + v[b]) / 2]) for v in (vertices, normals, uv))
+        new = len(faces) + np.arange(len(check))
+        faces[check] = np.stack([a, middle, c], 1)
+        faces = np.concatenate([faces, np.stack([middle, b, c], 1)])
+        surface = np.concatenate([surface, surface[check]])
+        check = np.concatenate([check, new])
+    return replace(mesh, vertices=vertices, normals=normals, uv=uv, faces=faces, surface=surface)
+
+
 def _within_wheels(
-    p: Float[np.ndarray, "v 3"], front: Float[np.ndarray, "3"], rear: Float[np.ndarray, "3"]
+    p: Float[np.ndarray, "v 3"], front: Float[np.ndarray, "3"], rear: Float[np.ndarray, "3"], radius: float
 ) -> Bool[np.ndarray, "v"]:
-    """Vertices inside the cylinders of the wheels: brakes and hubs that carry other names."""
+    """Vertices inside cylinders of so many wheel radii: brakes and hubs that carry other names."""
     inside = np.zeros(len(p), dtype=bool)
     for hub in (front, rear):
-        near = np.hypot(p[:, 0] - hub[0], p[:, 2] - hub[2]) < 0.93 * hub[2]
+        near = np.hypot(p[:, 0] - hub[0], p[:, 2] - hub[2]) < radius * hub[2]
         inside |= near & (np.abs(p[:, 1]) > abs(hub[1]) - 0.28)
     return inside
 
@@ -126,6 +153,10 @@ def _body_map(body: Body, to: Proportions) -> Callable[[np.ndarray], np.ndarray]
         out[:, 0] = along_x(p[:, 0]) - to.rake * above
         out[:, 1] = p[:, 1] * to.width * (1 - to.lean * above)
         raised = _step(p[:, 2], 0.45, 0.9)
+        # low down only what lies between the arches may move
+        between = _step(p[:, 0], x[2], x[2] + 0.5) * _step(-p[:, 0], -x[3], 0.5 - x[3])
+        whole = _step(p[:, 0], x[0], x[0] + 1.1) * _step(-p[:, 0], -x[5], 1.1 - x[5])
+        out[:, 0] += to.cabin_m * (between + _step(p[:, 2], 2.2 * front[2], belt + 0.05) * (whole - between))
         nose = to.nose_m * raised * _step(p[:, 0], front[0] - 0.6, front[0] + 0.3)
         tail = to.tail_m * raised * _step(-p[:, 0], -rear[0] - 0.4, -rear[0] + 0.5)
         out[:, 2] = up + to.ride_m * _step(p[:, 2], 0.02, 0.25) + nose + tail
