@@ -1,7 +1,7 @@
 """Where the second-order solver may start: given poses, circles, or a car template found in every view by itself."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 

@@ -14,6 +14,7 @@ from kronc_ns.capture.depth import depth_estimator, with_depths
 from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.capture.detection.detector import Detector
 from kronc_ns.capture.detection.finding import find_keypoints
+from kronc_ns.capture.detection.guided import GuidedDetector, is_better, look_again, usual_sigma_m
 from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, find_frames, prepare_frames
 from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics, read_calibration
 from kronc_ns.capture.masks import find_masks, write_masks
@@ -30,11 +31,13 @@ from kronc_ns.files.output import claim_output, write_json
 from kronc_ns.files.record import write_solution
 from kronc_ns.files.scene_folder import load_scene, match_keypoints
 from kronc_ns.files.transforms import transforms_dict
+from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.fit.starts import MIN_POINTS
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.scene import Scene
 from kronc_ns.show.report import write_report
+from kronc_ns.solution import Solution, Status
 
 
 @dataclass
@@ -131,6 +134,9 @@ class KroncToNerfstudio:
             scene = with_depths(scene, out, config, self.depth_weights, progress)
         with solving() as progress:
             solution = solve_scene(scene, config, progress)
+        again = ""
+        if isinstance(detector, GuidedDetector) and solution.status is not Status.FAILED:
+            scene, solution, again = _look_again(detector, scene, solution, config, out)
         report = write_solution(out, scene, solution, out, fingerprint(scene, config))
 
         table = report_table(report, (*scene.notes, *([note] if note else [])))
@@ -141,6 +147,8 @@ class KroncToNerfstudio:
         if mask_note:
             table.add_row("masks", mask_note)
         table.add_row("keypoints", _seen(scene))
+        if again:
+            table.add_row("second look", again)
         refined = f", refined to {solution.camera.fx:.1f} px" if config.refine_focal else ""
         table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}{refined}")
         table.add_row("report", str(write_report(out)))
@@ -212,6 +220,25 @@ def main() -> None:
 def _detect(detector: Detector, frames: Frames, masks: tuple[str, ...] | None, out: Path) -> Detections:
     with progress_bar("detecting") as progress:
         return find_keypoints(detector, out, frames.names, frames.size, masks, progress)
+
+
+def _look_again(
+    detector: GuidedDetector, scene: Scene, solution: Solution, config: KroncConfig, out: Path
+) -> tuple[Scene, Solution, str]:
+    """Look for the points where the solution expects them and solve again; kept, and written, if that is better."""
+    with progress_bar("looking again") as progress:
+        looked = look_again(detector, out, scene, solution, progress)
+    second = solve_scene(looked, config)
+    change = (
+        f"points a view {scene.visibility.sum(1).mean():.1f} -> {looked.visibility.sum(1).mean():.1f}, camera centre "
+        f"± {usual_sigma_m(solution):.3f} -> {usual_sigma_m(second):.3f} m"
+    )
+    if not is_better(second, solution):
+        return scene, solution, f"no better, left ({change})"
+    size = (scene.camera.width, scene.camera.height)
+    rows = dict(zip(looked.names, looked.keypoints, strict=True))
+    write_keypoints(out / "keypoints.json", looked.schema, size, rows, looked.sigma_px)
+    return looked, second, f"kept: {change}"
 
 
 def _seen(scene: Scene) -> str:

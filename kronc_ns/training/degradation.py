@@ -58,7 +58,7 @@ def _glare(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         )
     spot = np.zeros((height // 8, width // 8), np.float32)
     at = (int(rng.integers(width // 8)), int(rng.integers(height // 8)))
-    cv2.circle(spot, at, int(rng.integers(1, 5)), 1.0, -1)
+    cv2.circle(spot, at, int(rng.integers(1, 5)), (1.0,), -1)
     spot = cv2.GaussianBlur(spot, (0, 0), float(rng.uniform(1, 5)))
     spot = cv2.resize(spot / max(float(spot.max()), 1e-6), (width, height)) * rng.uniform(40, 200)
     return np.clip(rgb + spot[..., None], 0, 255).astype(np.uint8)
@@ -74,7 +74,7 @@ def _blurred(rgb: np.ndarray, rng: np.random.Generator, strength: float) -> np.n
     angle, middle = rng.uniform(0, np.pi), size // 2
     reach = np.array([np.cos(angle), np.sin(angle)]) * length / 2
     ends = [tuple(int(v) for v in np.round(16 * (middle + sign * reach))) for sign in (-1, 1)]
-    cv2.line(kernel, ends[0], ends[1], 1.0, 1, cv2.LINE_AA, 4)
+    cv2.line(kernel, ends[0], ends[1], (1.0,), 1, cv2.LINE_AA, 4)
     kernel = kernel + kernel[::-1, ::-1]  # centred: the place of a point does not move
     return cv2.filter2D(rgb, -1, kernel / kernel.sum())
 

@@ -41,7 +41,7 @@ def export(checkpoint: Path, output: Path) -> None:
     torch.onnx.export(
         deployed,
         (torch.zeros(1, INPUT_SIZE[1], INPUT_SIZE[0], 3, dtype=torch.uint8),),
-        buffer,
+        buffer,  # pyright: ignore[reportArgumentType]
         input_names=["image"],
         output_names=["heat", "visible", "mask"],
         dynamic_axes={name: {0: "batch"} for name in ("image", "heat", "visible", "mask")},

@@ -83,7 +83,7 @@ def train(options: Training, device: str = "cpu", compiled: bool = True) -> Iter
     ``compiled`` fuses what lies between convolutions, for which PyTorch needs a C++ compiler: 1.3 times as fast.
     """
     torch.manual_seed(options.seed)
-    network = KeypointNetwork().to(device, memory_format=torch.channels_last)
+    network = KeypointNetwork().to(torch.device(device)).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     mean = AveragedModel(network, avg_fn=_running_mean, use_buffers=True)
     optimiser = torch.optim.AdamW(_groups(network, options.weight_decay), lr=options.learning_rate, betas=(0.9, 0.99))
     checkpoint = options.output / "checkpoint.pt"
@@ -155,7 +155,7 @@ def weights_of(checkpoint: Path) -> dict[str, Tensor]:
     return {key.removeprefix("module."): value for key, value in state.items() if key.startswith("module.")}
 
 
-def _running_mean(mean: Tensor, value: Tensor, count: Tensor) -> Tensor:
+def _running_mean(mean: Tensor, value: Tensor, count: Tensor | int) -> Tensor:
     # the first steps are not worth remembering
     decay = min(_DECAY, (1 + float(count)) / (10 + float(count)))
     return mean + (1 - decay) * (value - mean) if mean.is_floating_point() else value

@@ -44,7 +44,7 @@ class _Block(nn.Module):
         super().__init__()
         self.first = _ConvNorm(inputs, outputs, stride=stride)
         self.second = _ConvNorm(outputs, outputs)
-        nn.init.zeros_(self.second[1].weight)
+        nn.init.zeros_(self.second[1].weight)  # pyright: ignore[reportArgumentType]
         same = inputs == outputs and stride == 1
         self.shortcut = nn.Identity() if same else _ConvNorm(inputs, outputs, 1, stride)
 

@@ -29,27 +29,34 @@ def cover(
     if kind == "post":
         lean = rng.normal(0, 0.05) * height
         ends = (round(x), -5), (round(x + lean), round(rng.uniform(bottom, height + 20)))
-        cv2.line(hidden, *ends, 255, max(1, round(rng.uniform(0.01, 0.07) * span)), cv2.LINE_AA)
+        cv2.line(hidden, *ends, (255,), max(1, round(rng.uniform(0.01, 0.07) * span)), cv2.LINE_AA)
     elif kind == "person":
         tall = rng.uniform(0.25, 0.6) * span
         foot = bottom + rng.uniform(0, 0.1) * span
         cv2.ellipse(
-            hidden, (round(x), round(foot - 0.45 * tall)), (round(0.13 * tall), round(0.38 * tall)), 0, 0, 360, 255, -1
+            hidden,
+            (round(x), round(foot - 0.45 * tall)),
+            (round(0.13 * tall), round(0.38 * tall)),
+            0,
+            0,
+            360,
+            (255,),
+            -1,
         )
-        cv2.circle(hidden, (round(x), round(foot - 0.9 * tall)), round(0.08 * tall), 255, -1)
+        cv2.circle(hidden, (round(x), round(foot - 0.9 * tall)), round(0.08 * tall), (255,), -1)
         for sign in (-1, 1):
             knee = (round(x + sign * 0.07 * tall), round(foot))
-            cv2.line(hidden, (round(x), round(foot - 0.3 * tall)), knee, 255, max(1, round(0.08 * tall)))
+            cv2.line(hidden, (round(x), round(foot - 0.3 * tall)), knee, (255,), max(1, round(0.08 * tall)))
     elif kind == "plant":
         for _ in range(int(rng.integers(10, 60))):
             at = round(x + rng.normal(0, 0.08) * span), round(bottom + rng.normal(0, 0.08) * span)
-            cv2.circle(hidden, at, max(1, round(rng.uniform(0.005, 0.03) * span)), 255, -1)
+            cv2.circle(hidden, at, max(1, round(rng.uniform(0.005, 0.03) * span)), (255,), -1)
     else:
         half = rng.uniform(0.02, 0.12, 2) * span
         corners = cv2.boxPoints(
             ((float(x), float(y)), (float(2 * half[0]), float(2 * half[1])), float(rng.uniform(0, 90)))
         )
-        cv2.fillConvexPoly(hidden, np.round(corners).astype(np.int32), 255)
+        cv2.fillConvexPoly(hidden, np.round(corners).astype(np.int32), (255,))
     low, high = np.array(colour(rng), np.float32), np.array(colour(rng), np.float32)
     grain = cv2.resize(rng.uniform(0, 1, (12, 16)).astype(np.float32), (width, height))[..., None]
     share = cv2.GaussianBlur(hidden, (3, 3), 0)[..., None].astype(np.float32) / 255

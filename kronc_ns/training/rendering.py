@@ -36,7 +36,7 @@ class Stage:
         self.body = body
         self.bounds = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
         corners = mesh.vertices[mesh.faces]
-        self._scene = rtcore_scene.EmbreeScene()
+        self._scene = rtcore_scene.EmbreeScene()  # pyright: ignore[reportAttributeAccessIssue]
         self._triangles = TriangleMesh(self._scene, corners.astype(np.float32))
         self.faces = mesh.faces
         self.face_normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) + 1e-12)

@@ -30,6 +30,10 @@ class Placement:
         """Places in the network's input as places in the image."""
         return (uv - np.array(self.offset)) / np.array(self.scale)
 
+    def to_input(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """The inverse of `to_image`."""
+        return uv * np.array(self.scale) + np.array(self.offset)
+
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """The image as it is stored; where it is transparent, white shines through."""

@@ -125,6 +125,21 @@ def test_a_mask_says_which_car(detector: BuiltinDetector, tmp_path: Path):
     assert found(detector, image, empty) == []
 
 
+def test_points_are_looked_for_where_geometry_expects_them(detector: BuiltinDetector, tmp_path: Path):
+    box = (100.0, 80.0, 420.0, 230.0)
+    file = save(tmp_path / "car.png", draw_cars((640, 400), box))
+    expected = np.full((66, 2), np.nan)
+    expected[list(POINTS)] = car(box) + np.array([3.0, -2.0])
+    elsewhere = np.arange(len(POINTS)) % 2 == 0
+    expected[np.array(POINTS)[elsewhere]] += (60.0, 30.0)
+    (found,) = detector.look_again([CarImage(file)], expected[None])
+    given = found.confidence[list(POINTS)] > 0
+    assert not given[elsewhere].any(), "what the image does not show there is not given"
+    assert given[~elsewhere].all()
+    places = found.uv[list(POINTS)][~elsewhere]
+    assert np.abs(places - car(box)[~elsewhere]).max() < 1.0, "the image says where, not what was expected"
+
+
 def test_no_car_is_no_car(detector: BuiltinDetector, tmp_path: Path):
     assert found(detector, save(tmp_path / "a.png", draw_cars(SIZE))) == []
     patch = draw_cars(SIZE)

@@ -4,7 +4,7 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from kronc_ns.capture.detection.builtin.looks import (
     Blob,
@@ -13,6 +13,7 @@ from kronc_ns.capture.detection.builtin.looks import (
     beyond,
     blobs_in,
     car_in,
+    car_near,
     look_at,
     look_both_ways,
     overlap,
@@ -54,6 +55,24 @@ class BuiltinDetector:
     def detect(self, images: Sequence[CarImage]) -> Generator[list[CarDetection], None, None]:
         """The cars in each image."""
         return (self._detect(image) for image in images)
+
+    def look_again(
+        self, images: Sequence[CarImage], expected: Float[np.ndarray, "n j 2"]
+    ) -> Generator[CarDetection | None, None, None]:
+        """The car of each image with its points near ``expected`` (stored pixels; NaN: unknown)."""
+        return (self._look_again(image, places) for image, places in zip(images, expected, strict=True))
+
+    def _look_again(self, image: CarImage, expected: Float[np.ndarray, "j 2"]) -> CarDetection | None:
+        picture = read_upright(image.path)
+        places = picture.from_stored(expected)
+        inside = np.clip(places[np.isfinite(places).all(1)], 0.0, picture.rgb.shape[1::-1])
+        if not len(inside) or (np.ptp(inside, axis=0) < 4).any():
+            return None
+        box = np.concatenate([inside.min(0), inside.max(0)])
+        first = look_at(self._network, picture.rgb, box, _PADDING)
+        look = look_both_ways(self._network, picture.rgb, box, _PADDING, first)
+        car = car_near(look, places, self._network.card)
+        return None if car is None else _detection(car, picture)
 
     def _detect(self, image: CarImage) -> list[CarDetection]:
         picture = read_upright(image.path)

@@ -16,6 +16,7 @@ Box = Float[np.ndarray, "4"]
 FILL = 114
 """Grey of what lies outside the image."""
 _NEAR = 0.02  # of the car's diagonal: what confidence speaks of
+_REACH = 0.04  # of the diagonal: how far from where geometry expects it a point may be
 _MARGIN = 3  # cells around a car's mask in which its points may lie
 _GAP = 2  # cells on either side of a post before a car, in the looks at one car
 _SMALLEST = 6  # cells of a mask that may be a car
@@ -123,6 +124,29 @@ def car_in(look: Look, expected: Box, card: Card) -> Car | None:
     confidence = card.calibrated(np.where(its_own, visible * near, 0.0).clip(0, 1))
     confidence = np.where(its_own & (confidence >= card.point_confidence), confidence, 0.0)
     return Car(uv, confidence, card.sigma_factor * px_per_cell * places.spread, box, blob.share)
+
+
+def car_near(look: Look, expected: Float[np.ndarray, "j 2"], card: Card) -> Car | None:
+    """The car whose points are expected at pixels of the image (NaN: unknown): each point where the network sees it
+    within `_REACH`, no point elsewhere."""
+    known = np.isfinite(expected).all(1)
+    heat, visible, mask = look.answer
+    box = _around(np.array([*expected[known].min(0), *expected[known].max(0)]), np.zeros((0, 2)))
+    px_per_cell = STRIDE / look.placement.scale[0]
+    diagonal = float(np.hypot(*(box[2:] - box[:2]))) / px_per_cell
+    at = look.placement.to_input(np.where(known[:, None], expected, 0.0)) / STRIDE
+    across = np.arange(heat.shape[2]) + 0.5 - at[:, :1]
+    down = np.arange(heat.shape[1]) + 0.5 - at[:, 1:]
+    within = across[:, None, :] ** 2 + down[:, :, None] ** 2 < (_REACH * diagonal + 1) ** 2
+    nearby = np.where(known[:, None, None], heat * within, heat)
+    if not nearby.any():
+        return None
+    places = find_places(nearby)
+    near = mass_near(heat, places.cells, _NEAR * diagonal)
+    confidence = card.calibrated((visible * near).clip(0, 1))
+    confidence = np.where(confidence >= card.point_confidence, confidence, 0.0)
+    uv = look.placement.to_image(STRIDE * places.cells)
+    return Car(uv, confidence, card.sigma_factor * px_per_cell * places.spread, box, float((mask > 0.5).mean()))
 
 
 def beyond(look: Look, box: Box, size: tuple[int, int]) -> Box:

@@ -1,0 +1,76 @@
+"""Looking again with what geometry knows: once the car is solved, where each point should be is no longer a guess."""
+
+from collections.abc import Generator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from kronc_ns.capture.detection.detector import CarDetection, CarImage
+from kronc_ns.capture.progress import Count
+from kronc_ns.geometry.camera import reproject
+from kronc_ns.geometry.poses import posed
+from kronc_ns.scene import Scene
+from kronc_ns.solution import Solution, Status, ViewStatus
+
+_RANK = {Status.FAILED: 0, Status.WEAK: 1, Status.CONVERGED: 2}
+
+
+@runtime_checkable
+class GuidedDetector(Protocol):
+    """A detector that can be told where to look."""
+
+    def look_again(
+        self, images: Sequence[CarImage], expected: Float[np.ndarray, "n j 2"]
+    ) -> Generator[CarDetection | None, None, None]:
+        """The car of each image with its points near ``expected`` (stored pixels; NaN: unknown), as soon as each is
+        done; points that the image does not show there are not given."""
+        ...
+
+
+def look_again(
+    detector: GuidedDetector, folder: Path, scene: Scene, solution: Solution, progress: Count | None = None
+) -> Scene:
+    """The scene with the points of views that have a pose detected anew near where the solved ones project."""
+    located = np.flatnonzero(posed(solution.c2w))
+    images = [CarImage(folder / scene.names[view]) for view in located]
+    keypoints = scene.with_sides_swapped(np.array([view.swapped for view in solution.views])).keypoints.copy()
+    sigma = np.ones(keypoints.shape[:2]) if scene.sigma_px is None else scene.sigma_px.copy()
+    size = np.array([scene.camera.width, scene.camera.height])
+    answers = detector.look_again(images, expected_places(solution)[located])
+    for count, (view, car) in enumerate(zip(located, answers, strict=True), start=1):
+        if progress is not None:
+            progress(count, len(images), None)
+        if car is None or car.sigma_px is None:
+            continue
+        seen = (car.confidence > 0) & (car.uv >= 0).all(1) & (car.uv < size).all(1)
+        keypoints[view] = np.where(seen[:, None], np.column_stack([car.uv, car.confidence]), 0.0)
+        sigma[view] = np.where(seen, car.sigma_px, 0.0)
+    return replace(scene, keypoints=keypoints, sigma_px=sigma)
+
+
+def expected_places(solution: Solution) -> Float[np.ndarray, "n j 2"]:
+    """Pixels (distorted, as detected) of the solved points in every view; NaN behind a camera or without a pose."""
+    uv = reproject(solution.points, solution.c2w, solution.camera)
+    return solution.camera.distort(np.where(np.isfinite(uv), uv, np.nan))
+
+
+def is_better(second: Solution, first: Solution) -> bool:
+    """Whether a solution of points that were looked for again is to be kept: no view lost, and surer of the cameras."""
+    return (
+        _RANK[second.status] >= _RANK[first.status]
+        and _solved(second) >= _solved(first)
+        and (_RANK[second.status] > _RANK[first.status] or usual_sigma_m(second) < usual_sigma_m(first))
+    )
+
+
+def _solved(solution: Solution) -> int:
+    return int(solution.views_that_are(ViewStatus.SOLVED).sum())
+
+
+def usual_sigma_m(solution: Solution) -> float:
+    """Median standard deviation of the camera centres, in metres."""
+    known = [view.sigma_trans_m for view in solution.views if view.sigma_trans_m is not None]
+    return float(np.median(known)) if known else np.inf
