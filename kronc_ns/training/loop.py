@@ -85,7 +85,9 @@ def train(options: Training, device: str = "cpu", compiled: bool = True) -> Iter
     torch.manual_seed(options.seed)
     network = KeypointNetwork().to(torch.device(device)).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     mean = AveragedModel(network, avg_fn=_running_mean, use_buffers=True)
-    optimiser = torch.optim.AdamW(_groups(network, options.weight_decay), lr=options.learning_rate, betas=(0.9, 0.99))
+    optimiser = torch.optim.AdamW(
+        _groups(network, options.weight_decay), lr=options.learning_rate, betas=(0.9, 0.99), fused=True
+    )
     checkpoint = options.output / "checkpoint.pt"
     step = 0
     if checkpoint.is_file():

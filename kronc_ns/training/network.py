@@ -19,6 +19,7 @@ POINTS = 66
 _WIDTHS = (48, 96, 192, 320)  # channels at strides 4, 8, 16, 32
 _DECODER = 96
 _HEAD = 64
+_MAPS = 96  # 66 points, the mask and nothing: matrix units want multiples of 32, else this layer takes longest
 
 
 class Answer(NamedTuple):
@@ -69,8 +70,7 @@ class KeypointNetwork(nn.Module):
         self.smooth = nn.ModuleList([_ConvNorm(_DECODER, _DECODER) for _ in range(3)])
         self.to_fine = nn.ModuleList([nn.Conv2d(n, _HEAD, 1) for n in (a, _DECODER)])
         self.fine = _ConvNorm(_HEAD, _HEAD)
-        self.heat = nn.Conv2d(_HEAD, POINTS, 1)
-        self.mask = nn.Conv2d(_HEAD, 1, 1)
+        self.maps = nn.Conv2d(_HEAD, _MAPS, 1)
         self.seen_at = nn.Parameter(torch.randn(POINTS, _HEAD) / _HEAD**0.5)
         self.seen = nn.Linear(d, POINTS)
 
@@ -89,12 +89,13 @@ class KeypointNetwork(nn.Module):
         for lateral, smooth, skip in zip(self.lateral[1:], self.smooth[1:], (at16, at8), strict=True):
             up = F.relu(smooth(_twice(up) + lateral(skip)), inplace=True)
         fine = F.relu(self.fine(_twice(self.to_fine[1](up)) + self.to_fine[0](at4)), inplace=True)
-        heat = self.heat(fine).float()
+        maps = self.maps(fine)
+        heat = maps[:, :POINTS].float()
         logarithms = heat.flatten(2).log_softmax(-1)
         # whether a point is visible shows in what the picture looks like where the point is thought to be
         local = torch.einsum("bjs,bcs->bjc", logarithms.exp().to(fine.dtype), fine.flatten(2))
         visible = (local * self.seen_at).sum(-1).float() + self.seen(whole).float()
-        return Answer(logarithms.view_as(heat), visible, self.mask(fine).float()[:, 0])
+        return Answer(logarithms.view_as(heat), visible, maps[:, POINTS].float())
 
 
 def _twice(x: Tensor) -> Tensor:

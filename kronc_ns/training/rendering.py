@@ -4,81 +4,21 @@ Rays are cast by embree, light is added up by `shading`. World axes as everywher
 z = 0, metres.
 """
 
-from typing import Any
-
 import cv2
 import numpy as np
-from embreex import rtcore_scene
-from embreex.mesh_construction import TriangleMesh
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32
 
 from kronc_ns.geometry.poses import unit
 from kronc_ns.training.appearance import Look
-from kronc_ns.training.body import Body
 from kronc_ns.training.cameras import SIZE, Shot
 from kronc_ns.training.lighting import Surroundings
-from kronc_ns.training.shading import GLASS, GLOSS, LEVELS, shade, shade_ground
+from kronc_ns.training.shading import GLASS, GLOSS, shade, shade_ground
 from kronc_ns.training.shards import Picture
+from kronc_ns.training.stage import SHADOW_M, SURFACE_M, Stage
 
-_VISIBLE_M = 0.04  # by how much a surface may lie before a keypoint that counts as visible
-_SURFACE_M = 0.004  # rays start off the surface
+_AROUND_M = 0.015  # a keypoint is visible where one sees the surface so far beside it: outlines
+_FAINT = 0.08  # share of the sky whose lack no longer shows on the backdrop of a cut-out
 _PANES = 2  # windows that one looks through
-_SHADOW_M = 5.0  # from the car's centre: where its shadow may fall
-_SKY_RAYS = 400_000  # in all, from the vertices of a body
-_VIEWS = ("left", "right", "front", "rear", "top")
-
-
-class Stage:
-    """A body made ready for rays; keep it for all its pictures."""
-
-    def __init__(self, body: Body, rng: np.random.Generator) -> None:
-        mesh = body.mesh
-        self.body = body
-        self.bounds = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
-        corners = mesh.vertices[mesh.faces]
-        self._scene = rtcore_scene.EmbreeScene()  # pyright: ignore[reportAttributeAccessIssue]
-        self._triangles = TriangleMesh(self._scene, corners.astype(np.float32))
-        self.faces = mesh.faces
-        self.face_normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) + 1e-12)
-        self.occlusion = self._open_sky(rng)
-        self.ground_open = self._open_ground(rng)
-        self.mesh = (
-            mesh.normals.astype(np.float32),
-            mesh.uv.astype(np.float32),
-            self.occlusion,
-            mesh.surface.astype(np.int64),
-            self.face_normal.astype(np.float32),
-        )
-        self.texels, self.texture_at = _packed_textures(mesh.surfaces)
-        self.decals, self.decal_texels = _packed_decals(body)
-
-    def hit(self, start: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
-        """Face (``primID``, -1: none), distance ``tfar`` and weights ``u``, ``v`` of its second and third corner."""
-        return self._scene.run(
-            np.ascontiguousarray(start, np.float32), np.ascontiguousarray(direction, np.float32), output=True
-        )
-
-    def blocked(self, start: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]) -> np.ndarray:
-        """Whether each ray meets the car."""
-        start, direction = np.ascontiguousarray(start, np.float32), np.ascontiguousarray(direction, np.float32)
-        return self._scene.run(start, direction, query="OCCLUDED") == 0
-
-    def _open_sky(self, rng: np.random.Generator) -> Float32[np.ndarray, "v"]:
-        """Share of the hemisphere that each vertex sees, weighted by the cosine."""
-        mesh = self.body.mesh
-        rays = int(np.clip(_SKY_RAYS // len(mesh.vertices), 4, 24))
-        directions = unit(mesh.normals[:, None] + unit(rng.standard_normal((len(mesh.normals), rays, 3))))
-        start = np.repeat(mesh.vertices + 2 * _SURFACE_M * mesh.normals, rays, axis=0)
-        blocked = self.blocked(start, directions.reshape(-1, 3)).reshape(-1, rays)
-        return (1 - blocked.mean(1)).astype(np.float32)
-
-    def _open_ground(self, rng: np.random.Generator, rays: int = 64) -> Float32[np.ndarray, "40 40"]:
-        """The same for places on the ground, over a square of 2 `_SHADOW_M`."""
-        axis = (np.arange(40) + 0.5) / 40 * 2 * _SHADOW_M - _SHADOW_M
-        places = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
-        start = np.repeat(np.column_stack([places, np.full(len(places), 0.002)]), rays, axis=0)
-        directions = unit(np.array([0, 0, 1.0]) + unit(rng.standard_normal((len(start), 3))))
-        return (1 - self.blocked(start, directions).reshape(40, 40, rays).mean(2)).astype(np.float32)
 
 
 def render(stage: Stage, look: Look, around: Surroundings, shot: Shot, rng: np.random.Generator) -> Picture:
@@ -114,8 +54,11 @@ def keypoints_seen(stage: Stage, shot: Shot) -> Float[np.ndarray, "66 3"]:
     eye = shot.c2w[:, 3]
     way = points - eye
     distance = np.linalg.norm(way, axis=1)
-    found = stage.hit(np.broadcast_to(eye, way.shape), way / distance[:, None])
-    free = (found["primID"] < 0) | (found["tfar"] > distance - _VISIBLE_M)
+    beside = _AROUND_M * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) @ shot.c2w[:, :2].T
+    to = unit(way[:, None] + beside)
+    found = stage.hit(np.broadcast_to(eye, (to.size // 3, 3)), to.reshape(-1, 3))
+    before = distance[:, None] - np.where(found["primID"] < 0, np.inf, found["tfar"]).reshape(-1, len(beside))
+    free = (before < stage.recess[:, None]).any(1)
     inside = (depth > 0.05) & (uv > 0).all(1) & (uv < SIZE).all(1)
     state = np.where(present, np.where(free & inside, 1.0, 2.0), 0.0)
     return np.column_stack([np.where(depth[:, None] > 0.05, uv, -1e3), state])
@@ -124,7 +67,8 @@ def keypoints_seen(stage: Stage, shot: Shot) -> Float[np.ndarray, "66 3"]:
 def _trace(
     stage: Stage, look: Look, around: Surroundings, light: tuple[np.ndarray, ...], shot: Shot, pixels: np.ndarray
 ) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
-    """Radiance along the rays of pixels, and the surface of the car that each meets (-1: none)."""
+    """Radiance along the rays of pixels (beside a car that was cut out: the share of the backdrop's), and the surface
+    of the car that each meets (-1: none)."""
     direction = shot.rays(pixels)
     start = np.broadcast_to(shot.c2w[:, 3], direction.shape)
     first = stage.hit(start, direction)
@@ -137,7 +81,10 @@ def _trace(
         on = found["primID"] >= 0
         if (~on).any():
             miss = active[~on]
-            behind = _surroundings(stage, around, light, origin[~on], direction[miss])
+            if pane == 0 and around.backdrop is not None:
+                behind = _soft_shadow(stage, around, origin[~on], direction[miss])
+            else:
+                behind = _surroundings(stage, around, light, origin[~on], direction[miss])
             colour[miss] += share[miss, None] * behind
         if not on.any():
             break
@@ -173,7 +120,7 @@ def _on_car(
     sunlit = np.zeros(len(face))
     if light[5].any():
         turned = np.flatnonzero(facing * (normal @ light[4]) > 0)
-        off = at[turned] + 2 * _SURFACE_M * (facing[:, None] * normal)[turned]
+        off = at[turned] + 2 * SURFACE_M * (facing[:, None] * normal)[turned]
         sunlit[turned] = ~stage.blocked(off, np.broadcast_to(light[4], off.shape))
     paint = (
         look.kind,
@@ -202,25 +149,16 @@ def _surroundings(
 ) -> Float[np.ndarray, "n 3"]:
     """Radiance along rays that miss the car: the ground near it, else the panorama."""
     out = _panorama(around.sharp, direction)
-    falling = direction[:, 2] < -1e-6
-    distance = np.where(falling, start[:, 2] / np.where(falling, -direction[:, 2], 1.0), np.inf)
-    place = start[:, :2] + np.where(falling, distance, 0.0)[:, None] * direction[:, :2]
+    falling, distance, place = _on_ground(start, direction)
     radius = np.linalg.norm(place, axis=1)
     on = np.flatnonzero(falling & (radius < around.ground_radius_m))
     if not len(on):
         return out
-    place, near = place[on], radius[on] < 1.4 * _SHADOW_M
+    place, near = place[on], radius[on] < 1.4 * SHADOW_M
     shadow, dark = np.ones(len(on)), np.ones(len(on))
     if near.any():
         p = place[near]
-        cell = np.clip(((p + _SHADOW_M) / (2 * _SHADOW_M) * 40 - 0.5), 0, 38.999)
-        i, j = np.floor(cell).astype(int).T
-        a, b = (cell - np.floor(cell)).T
-        grid = stage.ground_open
-        sky = (1 - a) * ((1 - b) * grid[i, j] + b * grid[i, j + 1]) + a * (
-            (1 - b) * grid[i + 1, j] + b * grid[i + 1, j + 1]
-        )
-        dark[near] = 1 - around.shadow * (1 - sky)
+        dark[near] = 1 - around.shadow * (1 - stage.sky_above(p))
         if light[5].any():
             off = np.column_stack([p, np.full(len(p), 0.003)])
             hidden = stage.blocked(off, np.broadcast_to(light[4], off.shape))
@@ -229,6 +167,25 @@ def _surroundings(
     shade_ground(place, distance[on], shadow, dark, around.ground, around.ground_m, light, ground)
     out[on] = ground
     return out
+
+
+def _on_ground(
+    start: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
+) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
+    """Which rays fall onto the plane z = 0, how far off, and where."""
+    falling = direction[:, 2] < -1e-6
+    distance = np.where(falling, start[:, 2] / np.where(falling, -direction[:, 2], 1.0), np.inf)
+    return falling, distance, start[:, :2] + np.where(falling, distance, 0.0)[:, None] * direction[:, :2]
+
+
+def _soft_shadow(
+    stage: Stage, around: Surroundings, start: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """What the contact shadow leaves of a backdrop."""
+    falling, _, place = _on_ground(start, direction)
+    hidden = np.where(falling, np.maximum(1 - _FAINT - stage.sky_above(place), 0) / (1 - _FAINT), 0.0)
+    share = 1 - around.shadow * hidden
+    return np.repeat(share[:, None], 3, axis=1)
 
 
 def _panorama(image: Float32[np.ndarray, "h w 3"], direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -268,7 +225,7 @@ def _displayed(
     linear = colour * exposure
     shown = np.clip(linear / (1 + 0.25 * linear) * 1.15, 0, 1) ** (1 / 2.2)
     if around.backdrop is not None:
-        shown = np.where((surface >= 0)[:, None], shown, around.backdrop)
+        shown = np.where((surface >= 0)[:, None], shown, around.backdrop * colour)
     return shown
 
 
@@ -285,42 +242,3 @@ def _packed_light(around: Surroundings) -> tuple[np.ndarray, ...]:
         around.sun_rgb.astype(np.float64),
         np.concatenate([0.8 * bounced, mean]).astype(np.float64),
     )
-
-
-def _packed_textures(surfaces: Any) -> tuple[np.ndarray, np.ndarray]:
-    """All textures one after the other, and start, height and width of each surface's (height 0: none)."""
-    at, parts, start = np.zeros((len(surfaces), 3), np.int64), [np.zeros((1, 3), np.uint8)], 1
-    for index, surface in enumerate(surfaces):
-        if surface.texture is not None:
-            at[index] = start, *surface.texture.shape[:2]
-            parts.append(surface.texture.reshape(-1, 3))
-            start += len(parts[-1])
-    return np.concatenate(parts), at
-
-
-def _packed_decals(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of view, left, top, metres per texel, gloss, then start, height, width of each level, then 1 for each
-    surface that takes the decal; and all texels."""
-    names = [surface.name for surface in body.mesh.surfaces]
-    rows, parts, start = np.zeros((len(body.decals), 5 + 3 * LEVELS + len(names))), [], 0
-    for index, decal in enumerate(body.decals):
-        rows[index, :5] = _VIEWS.index(decal.view), *decal.corner, decal.metres_per_texel, decal.glossy
-        rows[index, 5 + 3 * LEVELS :] = [decal.surfaces is None or name in decal.surfaces for name in names]
-        for level, image in enumerate(_shrunk(decal.rgba)):
-            rows[index, 5 + 3 * level : 8 + 3 * level] = start, *image.shape[:2]
-            parts.append(image.reshape(-1, 4))
-            start += len(parts[-1])
-    return rows, np.concatenate(parts) if parts else np.zeros((1, 4), np.uint8)
-
-
-def _shrunk(rgba: UInt8[np.ndarray, "h w 4"]) -> list[UInt8[np.ndarray, "_ _ 4"]]:
-    """An image in halves of its size; colours count by their alpha."""
-    alpha = rgba[..., 3:].astype(np.float32)
-    whole = np.concatenate([rgba[..., :3] * (alpha / 255), alpha], axis=2)
-    levels = [rgba]
-    for level in range(1, LEVELS):
-        size = (max(1, rgba.shape[1] >> level), max(1, rgba.shape[0] >> level))
-        small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
-        colour = small[..., :3] * 255 / np.maximum(small[..., 3:], 1)
-        levels.append(np.concatenate([colour, small[..., 3:]], axis=2).clip(0, 255).astype(np.uint8))
-    return levels

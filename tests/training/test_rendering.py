@@ -1,19 +1,19 @@
 import numpy as np
 import pytest
 
-from kronc_ns.synthetic.car import build_car
 from kronc_ns.training.appearance import draw_look
 from kronc_ns.training.cameras import SIZE, draw_shot
 from kronc_ns.training.lighting import draw_surroundings
-from kronc_ns.training.procedural import procedural_body
-from kronc_ns.training.rendering import Stage, keypoints_seen, render
+from kronc_ns.training.procedural import draw_procedural
+from kronc_ns.training.rendering import keypoints_seen, render
+from kronc_ns.training.stage import Stage
 
 LEFT, RIGHT = [7, 20, 10, 13], [50, 37, 47, 44]
 
 
 @pytest.fixture(scope="module")
 def stage():
-    return Stage(procedural_body(build_car()), np.random.default_rng(0))
+    return Stage(draw_procedural(np.random.default_rng(4)), np.random.default_rng(0))
 
 
 def _shots(stage, count, seed=0):
@@ -69,3 +69,24 @@ def test_the_same_seed_renders_the_same_picture(stage):
         return render(stage, draw_look(rng, stage.body.mesh), around, shot, rng)
 
     np.testing.assert_array_equal(once().rgb, once().rgb)
+
+
+def test_wheel_centres_are_seen_from_beside(stage):
+    beside = [shot for shot in _shots(stage, 80, seed=5) if shot.c2w[1, 3] > 2 * abs(shot.c2w[0, 3])]
+    assert beside
+    for shot in beside:
+        points = keypoints_seen(stage, shot)[[7, 20]]
+        inside = ((points[:, :2] > 0) & (points[:, :2] < SIZE)).all(1)
+        assert (points[inside, 2] == 1).all()
+
+
+def test_cut_out_cars_stand_on_their_backdrop(stage):
+    rng = np.random.default_rng(6)
+    around = next(a for a in iter(lambda: draw_surroundings(rng, []), None) if a.backdrop is not None and a.shadow > 0)
+    shot = _shots(stage, 1, seed=7)[0]
+    picture = render(stage, draw_look(rng, stage.body.mesh), around, shot, rng)
+    beside = picture.rgb[picture.mask == 0].astype(int)
+    colour = np.round(255 * around.backdrop)
+    # but for the pixels at the edge of the car, the backdrop, or a shadow on it
+    assert (np.abs(beside - colour).max(1) <= 1).mean() > 0.4
+    assert (beside <= colour + 1).all(1).mean() > 0.95
