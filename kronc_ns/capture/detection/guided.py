@@ -59,11 +59,10 @@ def expected_places(solution: Solution) -> Float[np.ndarray, "n j 2"]:
 
 def is_better(second: Solution, first: Solution) -> bool:
     """Whether a solution of points that were looked for again is to be kept: no view lost, and surer of the cameras."""
-    return (
-        _RANK[second.status] >= _RANK[first.status]
-        and _solved(second) >= _solved(first)
-        and (_RANK[second.status] > _RANK[first.status] or usual_sigma_m(second) < usual_sigma_m(first))
-    )
+    now, before = (_RANK[second.status], _solved(second)), (_RANK[first.status], _solved(first))
+    if now[0] < before[0] or now[1] < before[1]:
+        return False
+    return now > before or usual_sigma_m(second) < usual_sigma_m(first)
 
 
 def _solved(solution: Solution) -> int:
