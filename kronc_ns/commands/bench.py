@@ -22,9 +22,10 @@ _MOST_TRAININGS = 4  # at a time, of one thread and about 1.5 GB each
 class Bench:
     """Measure accuracy, speed or view synthesis on synthetic captures, beside what is asked of each row."""
 
-    suite: Literal["poses", "speed", "nvs"] = "poses"
+    suite: Literal["poses", "speed", "nvs", "detector"] = "poses"
     """poses: errors beside those of the best that the data allow; speed: time and memory beside other solvers'; nvs:
-    radiance fields trained on exact, solved and unsolved poses (CPU, half an hour on two cores)."""
+    radiance fields trained on exact, solved and unsolved poses (CPU, half an hour on two cores); detector: points and
+    poses from bare photos of --photos."""
     seeds: int | None = None
     """Number of seeds of every row (default: what the row asks for)."""
     first_seed: int = 0
@@ -38,6 +39,10 @@ class Bench:
     """On so many seeds 10,000 steps of Adam run beside (default: none in poses, 1 in speed); half a minute each."""
     scenes: int = 1000
     """Scenes of the throughput row."""
+    photos: Path | None = None
+    """Of detector: folder with spin_suv, captures, car_parts and cars; rows of what is not there are left out."""
+    detector_weights: Path | None = None
+    """Of detector: other weights than the builtin ones."""
     keep: Path | None = None
     """Of nvs: new folder for the captures, trained runs and pictures of the test views (default: they are deleted)."""
     json: bool = False
@@ -72,6 +77,11 @@ class Bench:
 
                     rows = nvs_rows(self._trainings(stack))
                     workers = min(len(os.sched_getaffinity(0)), _MOST_TRAININGS)
+                case "detector":
+                    from kronc_ns.benchmark.suites.detector import detector_rows
+
+                    rows, missing = detector_rows(self.photos or Path(), self.detector_weights)
+                    print("\n".join(missing), file=sys.stderr)
                 case _:
                     assert_never(self.suite)
             chosen = [row for row in rows if self.rows.lower() in row.name.lower()]

@@ -14,7 +14,7 @@ from kronc_ns.capture.depth import depth_estimator, with_depths
 from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.capture.detection.detector import Detector
 from kronc_ns.capture.detection.finding import find_keypoints
-from kronc_ns.capture.detection.guided import GuidedDetector, is_better, look_again, usual_sigma_m
+from kronc_ns.capture.detection.guided import GuidedDetector, second_look
 from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, find_frames, prepare_frames
 from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics, read_calibration
 from kronc_ns.capture.masks import find_masks, write_masks
@@ -225,20 +225,14 @@ def _detect(detector: Detector, frames: Frames, masks: tuple[str, ...] | None, o
 def _look_again(
     detector: GuidedDetector, scene: Scene, solution: Solution, config: KroncConfig, out: Path
 ) -> tuple[Scene, Solution, str]:
-    """Look for the points where the solution expects them and solve again; kept, and written, if that is better."""
+    """Look for the points where the solution expects them; the keypoints file follows if that is better."""
     with progress_bar("looking again") as progress:
-        looked = look_again(detector, out, scene, solution, progress)
-    second = solve_scene(looked, config)
-    change = (
-        f"points a view {scene.visibility.sum(1).mean():.1f} -> {looked.visibility.sum(1).mean():.1f}, camera centre "
-        f"± {usual_sigma_m(solution):.3f} -> {usual_sigma_m(second):.3f} m"
-    )
-    if not is_better(second, solution):
-        return scene, solution, f"no better, left ({change})"
-    size = (scene.camera.width, scene.camera.height)
-    rows = dict(zip(looked.names, looked.keypoints, strict=True))
-    write_keypoints(out / "keypoints.json", looked.schema, size, rows, looked.sigma_px)
-    return looked, second, f"kept: {change}"
+        looked, solution, note = second_look(detector, out, scene, solution, config, progress)
+    if looked is not scene:
+        rows = dict(zip(looked.names, looked.keypoints, strict=True))
+        size = (scene.camera.width, scene.camera.height)
+        write_keypoints(out / "keypoints.json", looked.schema, size, rows, looked.sigma_px)
+    return looked, solution, note
 
 
 def _seen(scene: Scene) -> str:

@@ -9,8 +9,9 @@ from kronc_ns.training.appearance import draw_look
 from kronc_ns.training.bodies import Model, draw_body
 from kronc_ns.training.cameras import draw_shot
 from kronc_ns.training.lighting import Panorama, draw_surroundings
-from kronc_ns.training.rendering import Stage, render
+from kronc_ns.training.rendering import render
 from kronc_ns.training.shards import Picture, write_shard
+from kronc_ns.training.stage import Stage
 
 _BODIES, _VIEWS = 8, 8  # in a shard
 _LEAST_VISIBLE = 3  # keypoints: pictures of less teach nothing
@@ -37,7 +38,7 @@ def draw_pictures(
         stage = Stage(draw_body(rng, garage), rng)
         for _ in range(_VIEWS):
             shot, around = draw_shot(rng, stage.bounds), draw_surroundings(rng, panoramas)
-            picture = render(stage, draw_look(rng, stage.body.mesh), around, shot, rng)
+            picture = render(stage, draw_look(rng, stage.body.mesh), around, shot)
             if (picture.keypoints[:, 2] == 1).sum() >= _LEAST_VISIBLE:
                 pictures.append(picture)
     return pictures

@@ -21,7 +21,7 @@ _FAINT = 0.08  # share of the sky whose lack no longer shows on the backdrop of 
 _PANES = 2  # windows that one looks through
 
 
-def render(stage: Stage, look: Look, around: Surroundings, shot: Shot, rng: np.random.Generator) -> Picture:
+def render(stage: Stage, look: Look, around: Surroundings, shot: Shot) -> Picture:
     """One picture with the car's mask and keypoints; edges are smoothed by casting four more rays a pixel."""
     width, height = SIZE
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)

@@ -50,7 +50,7 @@ def test_visible_points_lie_on_the_mask(stage):
     rng = np.random.default_rng(3)
     shown = 0
     for shot in _shots(stage, 4, seed=4):
-        picture = render(stage, draw_look(rng, stage.body.mesh), draw_surroundings(rng, []), shot, rng)
+        picture = render(stage, draw_look(rng, stage.body.mesh), draw_surroundings(rng, []), shot)
         assert picture.rgb.shape == (SIZE[1], SIZE[0], 3)
         visible = picture.keypoints[picture.keypoints[:, 2] == 1, :2]
         near = [
@@ -66,7 +66,7 @@ def test_the_same_seed_renders_the_same_picture(stage):
     def once():
         rng = np.random.default_rng(8)
         shot, around = draw_shot(rng, stage.bounds), draw_surroundings(rng, [])
-        return render(stage, draw_look(rng, stage.body.mesh), around, shot, rng)
+        return render(stage, draw_look(rng, stage.body.mesh), around, shot)
 
     np.testing.assert_array_equal(once().rgb, once().rgb)
 
@@ -84,7 +84,7 @@ def test_cut_out_cars_stand_on_their_backdrop(stage):
     rng = np.random.default_rng(6)
     around = next(a for a in iter(lambda: draw_surroundings(rng, []), None) if a.backdrop is not None and a.shadow > 0)
     shot = _shots(stage, 1, seed=7)[0]
-    picture = render(stage, draw_look(rng, stage.body.mesh), around, shot, rng)
+    picture = render(stage, draw_look(rng, stage.body.mesh), around, shot)
     beside = picture.rgb[picture.mask == 0].astype(int)
     colour = np.round(255 * around.backdrop)
     # but for the pixels at the edge of the car, the backdrop, or a shadow on it

@@ -10,6 +10,8 @@ from jaxtyping import Float
 
 from kronc_ns.capture.detection.detector import CarDetection, CarImage
 from kronc_ns.capture.progress import Count
+from kronc_ns.fit.options import KroncConfig
+from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.geometry.camera import reproject
 from kronc_ns.geometry.poses import posed
 from kronc_ns.scene import Scene
@@ -28,6 +30,28 @@ class GuidedDetector(Protocol):
         """The car of each image with its points near ``expected`` (stored pixels; NaN: unknown), as soon as each is
         done; points that the image does not show there are not given."""
         ...
+
+
+def second_look(
+    detector: GuidedDetector,
+    folder: Path,
+    scene: Scene,
+    solution: Solution,
+    config: KroncConfig,
+    progress: Count | None = None,
+) -> tuple[Scene, Solution, str]:
+    """What is better: the solution, or that of points looked for where it expects them; and a note that says by how
+    much."""
+    looked = look_again(detector, folder, scene, solution, progress)
+    second = solve_scene(looked, config)
+    points, now = (of.visibility.sum(1).mean() for of in (scene, looked))
+    change = (
+        f"points a view {points:.1f} -> {now:.1f}, views solved {_solved(solution)} -> {_solved(second)}, "
+        f"camera centre ± {_sigma_m(solution):.3f} -> {_sigma_m(second):.3f} m"
+    )
+    if is_better(second, solution):
+        return looked, second, f"kept: {change}"
+    return scene, solution, f"no better, left: {change}"
 
 
 def look_again(
@@ -62,14 +86,14 @@ def is_better(second: Solution, first: Solution) -> bool:
     now, before = (_RANK[second.status], _solved(second)), (_RANK[first.status], _solved(first))
     if now[0] < before[0] or now[1] < before[1]:
         return False
-    return now > before or usual_sigma_m(second) < usual_sigma_m(first)
+    return now > before or _sigma_m(second) < _sigma_m(first)
 
 
 def _solved(solution: Solution) -> int:
     return int(solution.views_that_are(ViewStatus.SOLVED).sum())
 
 
-def usual_sigma_m(solution: Solution) -> float:
+def _sigma_m(solution: Solution) -> float:
     """Median standard deviation of the camera centres, in metres."""
     known = [view.sigma_trans_m for view in solution.views if view.sigma_trans_m is not None]
     return float(np.median(known)) if known else np.inf

@@ -1,0 +1,290 @@
+"""The suite of the detector: points and poses from bare photos, on data that it was not trained on."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TypeAlias
+
+import numpy as np
+
+from kronc_ns.benchmark.figures import Figures, pose_figures
+from kronc_ns.benchmark.photos import (
+    main_car,
+    part_errors,
+    photos_in,
+    read_part_photos,
+    solve_photos,
+    takes_left_for_right,
+    turn_steps,
+    wheel_errors,
+)
+from kronc_ns.benchmark.suites.rows import Limit, Row, Statistic
+from kronc_ns.capture.detection.builtin.detector import BuiltinDetector
+from kronc_ns.capture.detection.detector import CarImage, Detector
+from kronc_ns.errors import KroncError
+from kronc_ns.files.images import read_mask
+from kronc_ns.files.keypoints import read_keypoints
+from kronc_ns.files.output import read_json
+from kronc_ns.files.transforms import camera_and_frames, read_poses
+from kronc_ns.solution import Solution, Status, ViewStatus
+
+Shown: TypeAlias = Mapping[Statistic, tuple[str, ...]]
+_TURNS = ("spin_duster_turntable", "spin_evox_stinger_blue", "spin_ertiga", "orbit_asx_park")
+_NOTHINGS = 20
+_CALIBRATION_PICTURES, _WALK_VIEWS = 120, 36
+_FRAMES, _FRAME_SIZE = 100, (1920, 1080)
+
+
+def detector_rows(photos: Path, weights: Path | None) -> tuple[list[Row], list[str]]:
+    """Rows of which ``photos`` holds the data, and why others are left out."""
+    detector = BuiltinDetector(weights)
+    rows: list[Row] = []
+    missing: list[str] = []
+    for folder, make in (
+        ("spin_suv", _turntable_rows),
+        *((f"captures/{name}", _turn_row) for name in _TURNS),
+        ("car_parts", _part_rows),
+        ("cars", _render_rows),
+    ):
+        if (photos / folder).is_dir():
+            rows += make(detector, photos / folder)
+        else:
+            missing.append(f"{photos / folder} is not there: its rows are left out")
+    rows += [
+        Row(
+            f"no car: {kind}",
+            f"{_NOTHINGS} rendered pictures without a car",
+            1,
+            partial(_false_alarms, detector, kind),
+            (Limit("cars", "total", at_most=0.0),),
+        )
+        for kind in ("surroundings", "object")
+    ]
+    rows.append(
+        Row(
+            "time and memory",
+            f"{_FRAMES} photos of {_FRAME_SIZE[0]}x{_FRAME_SIZE[1]} of a car, a process of its own",
+            1,
+            partial(_time, weights),
+            (Limit("seconds_taken", at_most=25.0), Limit("memory_gb", at_most=1.2)),
+        )
+    )
+    return rows, missing
+
+
+def _turntable_rows(detector: Detector, folder: Path) -> list[Row]:
+    return [
+        Row(
+            "spin_suv: points",
+            "36 studio photos, 806 measured points; distances in box diagonals",
+            1,
+            partial(_points, detector, folder),
+            (
+                Limit("median_percent", at_most=1.2),
+                Limit("within_3_percent", at_least=85.0),
+                Limit("found", at_least=70.0),
+            ),
+        ),
+        Row(
+            "spin_suv: poses, focal length given",
+            "36 bare photos against the reference poses",
+            1,
+            partial(_poses, detector, folder, True),
+            (Limit("solved", at_least=36.0), Limit("median_deg", at_most=1.5), Limit("median_cm", at_most=25.0)),
+        ),
+        Row(
+            "spin_suv: poses, focal length unknown",
+            "36 bare photos against the reference poses",
+            1,
+            partial(_poses, detector, folder, False),
+            (Limit("solved", at_least=36.0), Limit("median_deg", at_most=2.5)),
+            {"mean": ("median_cm",)},
+        ),
+    ]
+
+
+def _turn_row(detector: Detector, folder: Path) -> list[Row]:
+    limits = (
+        Limit("converged", at_least=1.0),
+        Limit("step_rms_deg", at_most=1.5),
+        Limit("sides_confused", "total", at_most=0.0),
+    )
+    shown: Shown = {"mean": ("solved", "views", "radius_rms_percent", "height_rms_percent")}
+    measure = partial(_turn, detector, folder)
+    return [Row(folder.name, "photos at equal steps, focal length unknown, no labels", 1, measure, limits, shown)]
+
+
+def _part_rows(detector: Detector, folder: Path) -> list[Row]:
+    limits = (
+        Limit("wheels_within_4_percent", at_least=85.0),
+        Limit("corners_within_4_percent", at_least=75.0),
+        Limit("photos_confused_percent", at_most=3.0),
+    )
+    shown: Shown = {"mean": ("photos_with_car", "points_a_photo")}
+    return [Row("car_parts", "100 photos of many cars", 1, partial(_parts, detector, folder), limits, shown)]
+
+
+def _render_rows(detector: Detector, folder: Path) -> list[Row]:
+    from kronc_ns.benchmark.renders import UNSEEN
+
+    limits = (
+        Limit("converged", "worst", at_least=1.0),
+        Limit("median_deg", at_most=1.0),
+        Limit("median_cm", at_most=8.0),
+    )
+    rows = [
+        Row(
+            f"rendered walk: {name}",
+            f"a car never trained on, {_WALK_VIEWS} views of 480x352, focal length given",
+            3,
+            partial(_walk, detector, folder / name),
+            limits,
+            {"mean": ("solved",)},
+        )
+        for name in UNSEEN
+    ]
+    measure = partial(_calibration, detector, folder)
+    note = f"{_CALIBRATION_PICTURES} renders of the cars never trained on"
+    rows.append(Row("calibration", note, 1, measure, (Limit("ece", at_most=0.05),), {"mean": ("points",)}))
+    return rows
+
+
+def _points(detector: Detector, folder: Path, _: int) -> Figures:
+    measured, errors, labelled = read_keypoints(folder / "keypoints.json"), [], 0
+    for name, instances in measured.frames.items():
+        rows = instances[0]
+        known = rows[:, 2] > 0
+        labelled += int(known.sum())
+        car = main_car(detector, folder / name)
+        if car is None:
+            continue
+        mask = read_mask(folder / "masks" / Path(name).name, measured.size or (1024, 512))
+        down, across = np.nonzero(mask)
+        diagonal = float(np.hypot(np.ptp(across) + 1, np.ptp(down) + 1))
+        both = known & (car.confidence > 0)
+        errors.append(np.linalg.norm(car.uv - rows[:, :2], axis=1)[both] / diagonal)
+    distance = 100 * np.concatenate(errors)
+    return {
+        "median_percent": float(np.median(distance)),
+        "within_3_percent": 100 * float((distance < 3).mean()),
+        "found": 100 * len(distance) / labelled,
+    }
+
+
+def _poses(detector: Detector, folder: Path, with_focal: bool, _: int) -> Figures:
+    content = read_json(folder / "reference.json")
+    camera, _frames = camera_and_frames(content, folder / "reference.json")
+    truth = read_poses(folder / "reference.json")
+    photos = photos_in(folder / "images")
+    centre = (camera.cx, camera.cy) if with_focal else None
+    solution = solve_photos(detector, photos, camera.fx if with_focal else None, centre)
+    reference = np.stack([truth[f"images/{photo.name}"] for photo in photos])
+    return {**pose_figures(solution.c2w, reference), "solved": float(_solved(solution))}
+
+
+def _turn(detector: Detector, folder: Path, _: int) -> Figures:
+    photos = photos_in(folder / "images")
+    solution = solve_photos(detector, photos, None)
+    residual, confused = turn_steps(solution.c2w)
+    eye = solution.c2w[np.isfinite(solution.c2w).all((1, 2)), :, 3]
+    radius = np.hypot(eye[:, 0], eye[:, 1])
+    return {
+        "converged": float(solution.status is Status.CONVERGED),
+        "step_rms_deg": float(np.sqrt(np.mean(residual**2))),
+        "sides_confused": float(confused.sum()),
+        "solved": float(_solved(solution)),
+        "views": float(len(photos)),
+        "radius_rms_percent": 100 * float(radius.std() / radius.mean()),
+        "height_rms_percent": 100 * float(eye[:, 2].std() / radius.mean()),
+    }
+
+
+def _parts(detector: Detector, folder: Path, _: int) -> Figures:
+    wheels, corners, confused, points, seen = [], [], [], [], 0
+    photos = read_part_photos(folder)
+    for photo in photos:
+        car = main_car(detector, photo.path)
+        if car is None:
+            continue
+        seen += 1
+        points.append(int((car.confidence > 0).sum()))
+        wheels.append(wheel_errors(photo, car))
+        corners.append(part_errors(photo, car))
+        confused.append(takes_left_for_right(photo, car))
+    told = [answer for answer in confused if answer is not None]
+    return {
+        "wheels_within_4_percent": 100 * float((np.concatenate(wheels) < 0.04).mean()),
+        "corners_within_4_percent": 100 * float((np.concatenate(corners) < 0.04).mean()),
+        "photos_confused_percent": 100 * float(np.mean(told)),
+        "photos_with_car": 100 * seen / len(photos),
+        "points_a_photo": float(np.mean(points)),
+    }
+
+
+def _walk(detector: Detector, folder: Path, seed: int) -> Figures:
+    from kronc_ns.benchmark.renders import WALK_FOCAL_PX, rendered_walk
+
+    with TemporaryDirectory(prefix="kronc-walk-") as output:
+        photos, truth = rendered_walk(folder, _WALK_VIEWS, seed, Path(output))
+        solution = solve_photos(detector, photos, WALK_FOCAL_PX)
+    converged = float(solution.status is Status.CONVERGED)
+    return {**pose_figures(solution.c2w, truth), "solved": float(_solved(solution)), "converged": converged}
+
+
+def _false_alarms(detector: Detector, kind: str, _: int) -> Figures:
+    from kronc_ns.benchmark.renders import save_all, without_car
+
+    with TemporaryDirectory(prefix="kronc-nothing-") as output:
+        files = save_all([without_car(kind, seed) for seed in range(_NOTHINGS)], Path(output))
+        found = [len(cars) for cars in detector.detect([CarImage(file) for file in files])]
+    return {"cars": float(sum(found))}
+
+
+def _calibration(detector: Detector, folder: Path, seed: int) -> Figures:
+    from kronc_ns.benchmark.renders import calibration_error, unseen_pictures
+
+    with TemporaryDirectory(prefix="kronc-calibration-") as output:
+        error, points = calibration_error(detector, unseen_pictures(folder, _CALIBRATION_PICTURES, seed), Path(output))
+    return {"ece": error, "points": float(points)}
+
+
+_TIMED = """
+import json, resource, sys, time
+from pathlib import Path
+from kronc_ns.capture.detection.builtin.detector import BuiltinDetector
+from kronc_ns.capture.detection.detector import CarImage
+start = time.perf_counter()
+detector = BuiltinDetector(Path(sys.argv[2]) if sys.argv[2] else None)
+files = sorted(Path(sys.argv[1]).iterdir())
+found = sum(bool(cars) for cars in detector.detect([CarImage(file) for file in files]))
+memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+print(json.dumps({"seconds_taken": time.perf_counter() - start, "memory_gb": memory, "with_car": found}))
+"""
+
+
+def _time(weights: Path | None, seed: int) -> Figures:
+    from PIL import Image
+
+    from kronc_ns.synthetic.car import build_car
+    from kronc_ns.synthetic.render import render_view
+    from kronc_ns.synthetic.scenes import default_camera, walk_poses
+
+    with TemporaryDirectory(prefix="kronc-time-") as output:
+        c2w = walk_poses(4, np.random.default_rng(seed))
+        drawn = [render_view(build_car(), pose, default_camera("walk"), ground=True, samples=1).rgba for pose in c2w]
+        for number in range(_FRAMES):
+            image = Image.fromarray(drawn[number % len(drawn)][..., :3]).resize(_FRAME_SIZE)
+            image.save(Path(output) / f"{number:03d}.jpg")
+        command = [sys.executable, "-c", _TIMED, output, str(weights or "")]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise KroncError(f"detection in a process of its own failed: {done.stderr.strip().splitlines()[-1]}")
+    return {name: float(value) for name, value in json.loads(done.stdout).items()}
+
+
+def _solved(solution: Solution) -> int:
+    return int(solution.views_that_are(ViewStatus.SOLVED).sum())
