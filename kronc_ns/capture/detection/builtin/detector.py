@@ -1,6 +1,6 @@
 """`--detector builtin`: looks at the whole image, then at the car, once more where it lies elsewhere than thought."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +10,14 @@ from kronc_ns.capture.detection.builtin.looks import (
     Blob,
     Box,
     Car,
+    Look,
     beyond,
     blobs_in,
     car_in,
     car_near,
     look_at,
     look_both_ways,
+    merged,
     overlap,
 )
 from kronc_ns.capture.detection.builtin.pictures import Upright, read_upright
@@ -32,7 +34,7 @@ _SAME_CAR = 0.5  # overlap of boxes of one car found twice
 _CARS = 3  # looked for in an image
 _OTHER_CAR = 0.2  # of the largest one's area, at least, to be looked at
 _FEW_POINTS = 3.0  # expected on a blob: less is no car
-_MIRRORED = True  # average with the mirror image in the last look
+_PADDINGS = (1.1, 1.22, 1.38)  # of the last looks, each with its mirror image
 _LARGE_PX = 1280  # longer side from which on a car may hide from tiles of half the image
 _POOR = 0.6  # mean confidence below which a car may be lying on its side
 _CLEARLY = 1.5  # times as many points expected after turning
@@ -69,9 +71,7 @@ class BuiltinDetector:
         if not len(inside) or (np.ptp(inside, axis=0) < 4).any():
             return None
         box = np.concatenate([inside.min(0), inside.max(0)])
-        first = look_at(self._network, picture.rgb, box, _PADDING)
-        look = look_both_ways(self._network, picture.rgb, box, _PADDING, first)
-        car = car_near(look, places, self._network.card)
+        car = self._from_all_looks(picture.rgb, box, lambda look: car_near(look, places, self._network.card))
         return None if car is None else _detection(car, picture)
 
     def _detect(self, image: CarImage) -> list[CarDetection]:
@@ -132,10 +132,16 @@ class BuiltinDetector:
             if overlap(wanted, box) >= _SAME_BOX:
                 break
             box, look = wanted, look_at(self._network, rgb, wanted, _PADDING)
-        if _MIRRORED:
-            look = look_both_ways(self._network, rgb, box, _PADDING, look)
-        car = car_in(look, box, card)
+        car = self._from_all_looks(rgb, box, lambda look: car_in(look, box, card))
         return car if car is not None and car.suffices(card) else None
+
+    def _from_all_looks(
+        self, rgb: UInt8[np.ndarray, "h w 3"], box: Box, find: Callable[[Look], Car | None]
+    ) -> Car | None:
+        """What looks of several widths and their mirror images find together; None if one of them finds nothing."""
+        cars = [find(look_both_ways(self._network, rgb, box, padding)) for padding in _PADDINGS]
+        found = [car for car in cars if car is not None]
+        return merged(found, self._network.card) if len(found) == len(cars) else None
 
     def _turned(self, picture: Upright, strength: float) -> CarDetection | None:
         """A car without points, where the image turned by 90, 180 or 270 degrees shows one much more clearly."""

@@ -1,5 +1,6 @@
 """One look of the network at a part of an image, and the cars that it sees there."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -81,13 +82,13 @@ def look_at(network: Network, rgb: UInt8[np.ndarray, "h w 3"], box: Box, padding
     return Look(network(drawn), placement)
 
 
-def look_both_ways(network: Network, rgb: UInt8[np.ndarray, "h w 3"], box: Box, padding: float, first: Look) -> Look:
-    """The mean of ``first``, a look at this box, and a look at its mirror image."""
+def look_both_ways(network: Network, rgb: UInt8[np.ndarray, "h w 3"], box: Box, padding: float) -> Look:
+    """The mean of a look at a box and one at its mirror image."""
     drawn, placement = crop(rgb, box, INPUT_SIZE, padding, FILL)
-    mirrored = network(np.ascontiguousarray(drawn[:, ::-1]))
+    first, mirrored = network(drawn), network(np.ascontiguousarray(drawn[:, ::-1]))
     flip = list(APOLLOCAR3D_66.flip)
     back = Answer(mirrored.heat[flip, :, ::-1], mirrored.visible[flip], mirrored.mask[:, ::-1])
-    return Look(Answer(*((one + other) / 2 for one, other in zip(first.answer, back, strict=True))), placement)
+    return Look(Answer(*((one + other) / 2 for one, other in zip(first, back, strict=True))), placement)
 
 
 def blobs_in(look: Look, gap: int = 0) -> list[Blob]:
@@ -147,6 +148,20 @@ def car_near(look: Look, expected: Float[np.ndarray, "j 2"], card: Card) -> Car 
     confidence = np.where(confidence >= card.point_confidence, confidence, 0.0)
     uv = look.placement.to_image(STRIDE * places.cells)
     return Car(uv, confidence, card.sigma_factor * px_per_cell * places.spread, box, float((mask > 0.5).mean()))
+
+
+def merged(cars: Sequence[Car], card: Card) -> Car:
+    """One car of several looks at it: places weighed by their confidence, which is averaged; looks that disagree on a
+    place make it less precise."""
+    confidence = np.stack([car.confidence for car in cars])
+    weight = confidence / np.maximum(confidence.sum(0), 1e-12)
+    uv = (weight[..., None] * np.stack([car.uv for car in cars])).sum(0)
+    apart = np.stack([np.square(car.uv - uv).sum(1) / 2 for car in cars])
+    variance = (weight * (np.stack([np.square(car.sigma_px) for car in cars]) + apart)).sum(0)
+    mean = confidence.mean(0)
+    boxes = np.stack([car.box for car in cars])
+    given = np.where(mean >= card.point_confidence, mean, 0.0)
+    return Car(uv, given, np.sqrt(variance), np.median(boxes, axis=0), float(np.mean([car.share for car in cars])))
 
 
 def beyond(look: Look, box: Box, size: tuple[int, int]) -> Box:
