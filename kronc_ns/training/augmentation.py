@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.training.degradation import degrade
-from kronc_ns.training.occlusion import backdrop, beside, clutter, cover
+from kronc_ns.training.occlusion import backdrop, beside, clutter, cover, watermark
 from kronc_ns.training.shards import Picture
 
 SIZE = (320, 224)
@@ -39,14 +39,16 @@ def augment(picture: Picture, others: Sequence[Picture], rng: np.random.Generato
         rgb = _cluttered(rgb, mask, rng)
     if others and rng.uniform() < 0.2:
         rgb, hidden = beside(rgb, mask, others[0], before=rng.uniform() < 0.2, rng=rng)
-        mask, keypoints = _covered(mask, keypoints, hidden)
+        mask, keypoints = covered(mask, keypoints, hidden)
     matrix, outside = draw_placement(mask, rng)
     rgb, mask, keypoints = place(rgb, mask, keypoints, matrix, outside)
     rows, columns = np.nonzero(mask)
     if len(rows) and rng.uniform() < 0.15:
         box = np.array([columns.min(), rows.min(), columns.max(), rows.max()], dtype=np.float64)
         rgb, hidden = cover(rgb, box, rng)
-        mask, keypoints = _covered(mask, keypoints, hidden)
+        mask, keypoints = covered(mask, keypoints, hidden)
+    if rng.uniform() < 0.04:
+        rgb = watermark(rgb, rng)
     if rng.uniform() < 0.5:
         rgb, mask = rgb[:, ::-1], mask[:, ::-1]
         keypoints = keypoints[_FLIP] * (-1, 1, 1) + (SIZE[0], 0, 0)
@@ -59,10 +61,8 @@ def negative(rng: np.random.Generator, others: Sequence[Picture]) -> Sample:
     rgb = backdrop(SIZE, others, rng)
     if others and rng.uniform() < 0.4:
         picture = others[0]
-        around = cv2.dilate(picture.mask, np.ones((25, 25), np.uint8))
-        patch = cv2.resize(backdrop((64, 48), others, rng), picture.rgb.shape[1::-1])
-        whole = np.where(around[..., None] > 0, patch, picture.rgb)
-        rgb = cv2.resize(whole, SIZE, interpolation=cv2.INTER_AREA)
+        patch = backdrop(SIZE, others, rng)
+        rgb = _mixed(patch, cv2.resize(picture.rgb, SIZE, interpolation=cv2.INTER_AREA), blot(picture.mask))
     rgb = clutter(rgb, int(rng.integers(0, 40)), rng)
     keypoints = np.zeros((len(_FLIP), 3))
     keypoints[:, 2] = 2
@@ -91,13 +91,16 @@ def draw_placement(mask: UInt8[np.ndarray, "h w"], rng: np.random.Generator) -> 
     angle = np.deg2rad(rng.normal(0, 4) if rng.uniform() < 0.85 else rng.normal(0, 14))
     stretch = np.exp(rng.normal(0, 0.04))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    linear = scale * turn @ np.diag([stretch, 1 / stretch])
+    shear = np.array([[1.0, rng.normal(0, 0.03)], [0.0, 1.0]])  # rows read one after another while the camera turns
+    linear = scale * turn @ shear @ np.diag([stretch, 1 / stretch])
     free = np.maximum(size - scale * sides, 0.0) / 2
     middle = size / 2 + (rng.uniform(-1, 1, 2) * free if room == 1.0 else rng.normal(0, room, 2) * scale * sides)
     if rng.uniform() < 0.08:  # cut by the border
         middle += rng.choice([-1, 1], 2) * rng.uniform(0.1, 0.4) * scale * sides
     offset = middle - linear @ ((low + high) / 2)
     outside = str(rng.choice(["grey", "edge", "plain"], p=[0.4, 0.35, 0.25]))
+    if outside == "edge" and any(side.any() for side in (mask[0], mask[-1], mask[:, 0], mask[:, -1])):
+        outside = "grey"  # else the car itself would be drawn out
     return np.column_stack([linear, offset]), outside
 
 
@@ -132,7 +135,7 @@ def place(
     return moved, cut, np.column_stack([uv, state])
 
 
-def _covered(
+def covered(
     mask: UInt8[np.ndarray, "h w"], keypoints: Float[np.ndarray, "66 3"], hidden: UInt8[np.ndarray, "h w"]
 ) -> tuple[UInt8[np.ndarray, "h w"], Float[np.ndarray, "66 3"]]:
     """Mask and points with what is hidden taken out."""
@@ -156,6 +159,13 @@ def _cluttered(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Things behind the car."""
     return _mixed(rgb, clutter(rgb, int(rng.integers(1, 15)), rng), mask)
+
+
+def blot(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "224 320"]:
+    """255 all over the car, fading beyond it: an outline alone would still be a car's."""
+    cells = cv2.resize(mask, (SIZE[0] // 8, SIZE[1] // 8), interpolation=cv2.INTER_AREA)
+    wide = cv2.dilate(np.where(cells > 0, 255, 0).astype(np.uint8), np.ones((9, 9), np.uint8))
+    return cv2.resize(cv2.GaussianBlur(wide, (7, 7), 1.2), SIZE, interpolation=cv2.INTER_LINEAR)
 
 
 def _mixed(front: np.ndarray, behind: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -11,6 +11,8 @@ def degrade(rgb: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[
     out = _tones(rgb, rng, strength)
     if rng.uniform() < 0.12 * strength:
         out = _glare(out, rng)
+    if rng.uniform() < 0.1 * strength:
+        out = _vignetted(out, rng)
     if rng.uniform() < 0.3 * strength:
         out = _blurred(out, rng, strength)
     if rng.uniform() < 0.25 * strength:
@@ -62,6 +64,14 @@ def _glare(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     spot = cv2.GaussianBlur(spot, (0, 0), float(rng.uniform(1, 5)))
     spot = cv2.resize(spot / max(float(spot.max()), 1e-6), (width, height)) * rng.uniform(40, 200)
     return np.clip(rgb + spot[..., None], 0, 255).astype(np.uint8)
+
+
+def _vignetted(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Darker away from the middle, about as the fourth power of a cosine."""
+    height, width = rgb.shape[:2]
+    row, column = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    share = (1 / (1 + rng.uniform(0.1, 0.6) * (row**2 + column**2) / 2) ** 2).astype(np.float32)
+    return (rgb * share[..., None]).astype(np.uint8)
 
 
 def _blurred(rgb: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:

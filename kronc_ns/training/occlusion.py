@@ -64,6 +64,20 @@ def cover(
     return out.astype(np.uint8), hidden
 
 
+def watermark(rgb: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+    """Lettering that one sees the picture through: it hides nothing."""
+    height, width = rgb.shape[:2]
+    over = rgb.copy()
+    words = "".join(chr(int(c)) for c in rng.integers(65, 91, int(rng.integers(4, 14))))
+    font, size, shade = int(rng.integers(0, 8)), float(rng.uniform(0.4, 1.6)), colour(rng)
+    start, step = rng.integers([-40, 10], [width // 2, height]), int(rng.integers(40, 200))
+    for line in range(int(rng.integers(1, 5))):
+        at = int(start[0]), int(start[1] + line * step) % (height + 20)
+        cv2.putText(over, words, at, font, size, shade, int(rng.integers(1, 3)), cv2.LINE_AA)
+    share = float(rng.uniform(0.2, 0.6))
+    return cv2.addWeighted(over, share, rgb, 1 - share, 0)
+
+
 def beside(
     rgb: UInt8[np.ndarray, "h w 3"],
     mask: UInt8[np.ndarray, "h w"],
