@@ -19,7 +19,7 @@ from kronc_ns.training.shards import Picture, Pictures
 _NEAR = 0.02  # of the car's box diagonal
 _KNOTS = 17
 # what is given and what is a car: chosen on rendered pictures without a car, see docs/detector.md
-_THRESHOLDS = {"point_confidence": 0.3, "car_points": 6, "car_confidence": 0.4, "car_area": 0.02}
+_THRESHOLDS = {"point_confidence": 0.3, "car_points": 10, "car_confidence": 0.45, "car_area": 0.02}
 
 
 def calibrate(weights: Path, pictures: Path, version: str) -> str:
