@@ -31,6 +31,8 @@ class Render:
     part: tuple[int, int] = (0, 1)
     """Which of how many processes this is."""
     seed: int = 0
+    kept_out: bool = False
+    """The cars that are kept out of training, to calibrate on."""
 
     def run(self) -> None:
         """Render and say what was written."""
@@ -40,7 +42,8 @@ class Render:
 
         panoramas = [] if self.panoramas is None else read_panoramas(self.panoramas)
         numbers = range(self.shards[0] + self.part[0], self.shards[1], self.part[1])
-        for file in render_shards(load_garage(self.cars_train, self.cars), panoramas, self.output, numbers, self.seed):
+        garage = load_garage(self.cars_train, self.cars, self.kept_out)
+        for file in render_shards(garage, panoramas, self.output, numbers, self.seed):
             print(file, flush=True)
 
 

@@ -41,7 +41,13 @@ _STYLES: dict[str, tuple[float, dict[str, float]]] = {
     "van": (1.0, {"length": 4.55, "width": 1.84, "height": 1.80, "wheelbase": 2.78, "belt_height": 1.06,
                   "cowl_height": 1.12, "boot_height": 1.12, "bonnet_length": 0.92, "nose_height": 0.88,
                   "rear_screen_run": 0.20, "boot_length": 0.05, "windscreen_run": 0.90, "tumblehome": 0.25}),
-    "coupe": (0.8, {"length": 4.45, "height": 1.34, "wheelbase": 2.62, "belt_height": 0.90, "cowl_height": 0.94,
+    "mpv": (1.2, {"length": 4.45, "width": 1.76, "height": 1.67, "wheelbase": 2.74, "wheel_radius": 0.31,
+                  "belt_height": 1.01, "cowl_height": 1.10, "nose_height": 0.87, "boot_height": 1.09,
+                  "bonnet_length": 0.95, "windscreen_run": 0.85, "rear_screen_run": 0.28, "boot_length": 0.05}),
+    "sports": (1.4, {"length": 4.35, "width": 1.84, "height": 1.24, "wheelbase": 2.48, "belt_height": 0.84,
+                     "cowl_height": 0.88, "nose_height": 0.64, "boot_height": 0.90, "boot_length": 0.30,
+                     "rear_screen_run": 1.05, "bonnet_length": 1.30, "windscreen_run": 0.80, "clearance": 0.13}),
+    "coupe": (1.8, {"length": 4.45, "height": 1.34, "wheelbase": 2.62, "belt_height": 0.90, "cowl_height": 0.94,
                     "boot_height": 0.98, "boot_length": 0.42, "rear_screen_run": 0.95, "bonnet_length": 1.32,
                     "windscreen_run": 0.85}),
 }  # fmt: skip
@@ -49,7 +55,7 @@ _STYLES: dict[str, tuple[float, dict[str, float]]] = {
 _SPREAD = {"length": 0.02, "width": 0.02, "wheelbase": 0.015, "wheel_radius": 0.05, "clearance": 0.10,
            "nose_height": 0.04, "bonnet_length": 0.06, "windscreen_run": 0.10, "rear_screen_run": 0.15,
            "tumblehome": 0.2}  # fmt: skip
-_TWO_DOORS = {"coupe": 0.9, "city": 0.4, "hatchback": 0.25}  # share without rear doors
+_TWO_DOORS = {"sports": 1.0, "coupe": 0.9, "city": 0.4, "hatchback": 0.25}  # share without rear doors
 _REAR_DOOR = [16, 17, 18, 19, 38, 39, 40, 41]
 _PAINTED = ("front_door", "rear_door", "bonnet", "boot", "front_plate", "rear_plate")
 _AXES = {"side": (0, 2), "front": (1, 2), "rear": (1, 2), "top": (0, 1)}
