@@ -22,10 +22,11 @@ _MOST_TRAININGS = 4  # at a time, of one thread and about 1.5 GB each
 class Bench:
     """Measure accuracy, speed or view synthesis on synthetic captures, beside what is asked of each row."""
 
-    suite: Literal["poses", "speed", "nvs", "detector"] = "poses"
+    suite: Literal["poses", "speed", "nvs", "detector", "trust"] = "poses"
     """poses: errors beside those of the best that the data allow; speed: time and memory beside other solvers'; nvs:
     radiance fields trained on exact, solved and unsolved poses (CPU, half an hour on two cores); detector: points and
-    poses from bare photos of --photos."""
+    poses from bare photos of --photos; trust: whether what is said of a solution is so, over captures with every kind
+    of trouble (trials from 100,000 on are those that the verdict was tuned on)."""
     seeds: int | None = None
     """Number of seeds of every row (default: what the row asks for)."""
     first_seed: int = 0
@@ -82,6 +83,10 @@ class Bench:
 
                     rows, missing = detector_rows(self.photos or Path(), self.detector_weights)
                     print("\n".join(missing), file=sys.stderr)
+                case "trust":
+                    from kronc_ns.benchmark.suites.trust import trust_rows
+
+                    rows = trust_rows(shapes)
                 case _:
                     assert_never(self.suite)
             chosen = [row for row in rows if self.rows.lower() in row.name.lower()]

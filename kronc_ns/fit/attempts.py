@@ -3,11 +3,12 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from kronc_ns.fit.noise import Noise, believed_noise
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.starts import MIN_POINTS, Hypothesis, usable_views
 from kronc_ns.geometry.poses import invert, make_pose
@@ -45,11 +46,19 @@ class Attempt:
     choice: str = ""
     """Why this start was preferred to others."""
 
+    @cached_property
+    def noise(self) -> Noise:
+        """Of the detections, as a judge should see it."""
+        camera = self.found.scene.camera
+        diagonal = math.hypot(camera.width, camera.height)
+        return believed_noise(self.problem, self.found.error_px, self.inlier, diagonal)
+
     def covariance(self) -> Float[np.ndarray, "n 6 6"]:
         """Of each camera (`camera_covariance`); NaN where nothing agrees."""
         if not self.inlier.any():
             return np.full((len(self.inlier), 6, 6), math.nan)
-        return camera_covariance(self.problem, self.state, self.inlier, self.sigma_px, self.shape_weight)
+        of_noise = camera_covariance(self.problem, self.state, self.inlier, self.noise.sigma_px, self.shape_weight)
+        return self.noise.widening**2 * of_noise
 
     @property
     def agreeing(self) -> Bool[np.ndarray, "n"]:

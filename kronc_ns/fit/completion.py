@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from kronc_ns.fit.verdict import Evidence, Verdict
+from kronc_ns.fit.verdict import Evidence, Verdict, known
 from kronc_ns.fit.walk import Interpolated, interpolate_walk
 from kronc_ns.geometry.poses import posed
 from kronc_ns.geometry.rotations import rotation_angle_deg
@@ -24,33 +24,49 @@ _NOISE_PX = 1.0  # least noise that is believed of so few detections
 def complete(
     scene: Scene, evidence: Evidence, verdict: Verdict
 ) -> tuple[Float[np.ndarray, "n 3 4"], tuple[ViewReport, ...]]:
-    """Poses and reports with the views that were not solved placed between their neighbours, where there is a walk."""
-    solved = verdict.solved
-    c2w = np.where(solved[:, None, None], evidence.c2w, math.nan)
-    if not solved.any() or solved.all():
-        return c2w, verdict.views
-    # the walk goes around the z axis through the car
-    known = np.isfinite(evidence.points).all(-1)
-    middle = evidence.points[known].mean(0) if known.any() else np.zeros(3)
-    walk = interpolate_walk(_shifted(c2w, -middle), solved)
-    if walk is None:
-        return c2w, verdict.views
-    walk = replace(walk, c2w=_shifted(walk.c2w, middle))
-    placed = ~solved & posed(walk.c2w)
-    aimed = _aimed(scene, evidence, verdict, walk, placed)
+    """Poses and reports with the views that were not solved placed as well as can be.
+
+    Views that agree with the others but are vaguely known keep their own pose where the walk between their neighbours
+    does not tell it better.
+    """
+    solved, vague = verdict.solved, verdict.vague
+    c2w = np.where((solved | vague)[:, None, None], evidence.c2w, math.nan)
+    sigma_rot, sigma_trans = (np.where(vague, of, math.nan) for of in (evidence.sigma_rot_deg, evidence.sigma_trans_m))
+    walk = _walk(evidence, solved)
+    between = np.zeros_like(solved)
+    if walk is not None:
+        surer = ~vague | ~(evidence.sigma_rot_deg <= walk.sigma_rot_deg)
+        between = ~solved & posed(walk.c2w) & surer
+        aimed = _aimed(scene, evidence, verdict, walk, between)
+        c2w = np.where(between[:, None, None], aimed, c2w)
+        sigma_rot, sigma_trans = (
+            np.where(between, of, own)
+            for of, own in ((walk.sigma_rot_deg, sigma_rot), (walk.sigma_trans_m, sigma_trans))
+        )
     views = tuple(
         replace(
             view,
             status=ViewStatus.COMPLETED,
-            reason=f"placed between its neighbours: {view.reason}",
-            sigma_rot_deg=float(walk.sigma_rot_deg[i]),
-            sigma_trans_m=float(walk.sigma_trans_m[i]),
+            reason=f"placed between its neighbours: {view.reason}" if between[i] else view.reason,
+            sigma_rot_deg=known(sigma_rot[i]),
+            sigma_trans_m=known(sigma_trans[i]),
         )
-        if placed[i]
+        if between[i] or vague[i]
         else view
         for i, view in enumerate(verdict.views)
     )
-    return np.where(placed[:, None, None], aimed, c2w), views
+    return c2w, views
+
+
+def _walk(evidence: Evidence, solved: Bool[np.ndarray, "n"]) -> Interpolated | None:
+    """The walk of the solved views around the z axis through the car."""
+    if not solved.any() or solved.all():
+        return None
+    points = np.isfinite(evidence.points).all(-1)
+    middle = evidence.points[points].mean(0) if points.any() else np.zeros(3)
+    c2w = np.where(solved[:, None, None], evidence.c2w, math.nan)
+    walk = interpolate_walk(_shifted(c2w, -middle), solved)
+    return None if walk is None else replace(walk, c2w=_shifted(walk.c2w, middle))
 
 
 def _shifted(c2w: Float[np.ndarray, "n 3 4"], by: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3 4"]:

@@ -15,6 +15,7 @@ from kronc_ns.fit.attempts import Attempt, adjust_starts, kept_steps, measured, 
 from kronc_ns.fit.car_frame import standing, template_frame
 from kronc_ns.fit.completion import complete
 from kronc_ns.fit.depths import prior_depths, random_depths
+from kronc_ns.fit.doubt import lead
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.repair import repair
 from kronc_ns.fit.starts import (
@@ -256,9 +257,11 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig, seconds: float)
         sigma_rot_deg=np.rad2deg(np.sqrt(variance[:, :3].sum(1))),
         sigma_trans_m=np.sqrt(variance[:, 3:].sum(1)) * placement.scale,
         swapped=found.swapped,
+        lead=lead(attempt),
         shape_weight=attempt.shape_weight if config.solver == "lm" and car_template(scene.schema) else None,
         converged=attempt.converged,
         iterations=attempt.iterations,
+        noise=attempt.noise,
     )
     verdict = judge(found.scene, evidence)
     solved, views = verdict.solved, verdict.views

@@ -15,6 +15,8 @@ from kronc_ns.solve.resection import locate, unexplained
 
 _ODD_SHARE = 0.3  # share of a view's detections on the far side of the car that makes the view suspect
 _REPAIRS = 3
+_PLENTY, _PLENTY_SHARE = 8, 0.7  # inliers, and their share, with which a view that fits is not asked again
+_CLEAR_GAIN = 0.5  # detections that another pose must meet more
 _HOPELESS = 0.02  # of the image diagonal: with such noise the points are no points to locate a view against
 
 
@@ -29,12 +31,13 @@ def repair(attempts: Sequence[Attempt], config: KroncConfig) -> list[Attempt]:
     for _ in range(_REPAIRS):
         changed: dict[int, Hypothesis] = {}
         for i in active:
-            suspect = _suspects(attempts[i])
+            suspect, doubtful = _suspects(attempts[i])
             before = asked[i]
-            if not suspect.any() or (before is not None and np.array_equal(suspect, before)):
+            wanted = suspect | doubtful
+            if not wanted.any() or (before is not None and np.array_equal(wanted, before)):
                 continue
-            asked[i] = suspect
-            mended = _relocated(attempts[i], suspect)
+            asked[i] = wanted
+            mended = _relocated(attempts[i], suspect, doubtful & ~suspect)
             if mended is not None:
                 changed[i] = mended
         if not changed:
@@ -52,12 +55,21 @@ def repair(attempts: Sequence[Attempt], config: KroncConfig) -> list[Attempt]:
     return attempts
 
 
-def _suspects(attempt: Attempt) -> Bool[np.ndarray, "n"]:
+def _suspects(attempt: Attempt) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Views that went wrong, and views that may have."""
     found, camera = attempt.found, attempt.found.scene.camera
     seen = found.scene.seen
     if attempt.sigma_px > _HOPELESS * math.hypot(camera.width, camera.height):
-        return np.zeros(len(seen), dtype=bool)
-    return usable_views(found.scene) & (_misfits(attempt) | _looks_through(attempt))
+        none = np.zeros(len(seen), dtype=bool)
+        return none, none
+    return usable_views(found.scene) & (_misfits(attempt) | _looks_through(attempt)), _doubtful(attempt)
+
+
+def _doubtful(attempt: Attempt) -> Bool[np.ndarray, "n"]:
+    """Views that fit with so few detections, or so few of them, that another pose may fit better."""
+    scene, inliers = attempt.found.scene, attempt.inlier.sum(1)
+    few = (inliers < _PLENTY) | (inliers < _PLENTY_SHARE * scene.seen.sum(1))
+    return usable_views(scene) & attempt.found.used & few
 
 
 def _misfits(attempt: Attempt) -> Bool[np.ndarray, "n"]:
@@ -72,28 +84,30 @@ def _looks_through(attempt: Attempt) -> Bool[np.ndarray, "n"]:
     return (attempt.found.far_side & seen).sum(1) > _ODD_SHARE * seen.sum(1)
 
 
-def _relocated(attempt: Attempt, suspect: Bool[np.ndarray, "n"]) -> Hypothesis | None:
+def _relocated(attempt: Attempt, suspect: Bool[np.ndarray, "n"], doubtful: Bool[np.ndarray, "n"]) -> Hypothesis | None:
     """The cameras with suspect views where they fit the solved points best, or left out; None if nothing changes.
 
-    A view that fits is only asked whether it fits better with its sides exchanged.
+    A view that fits is only asked whether it fits better with its sides exchanged; a doubtful one moves where it meets
+    more of its detections.
     """
     found = attempt.found
     scene, sigma = found.scene, attempt.sigma_px
     trusted = (attempt.inlier & ~suspect[:, None]).sum(0) >= 2
     points = np.where(trusted[:, None], found.points, math.nan)
     present = np.full(len(scene), math.inf)
-    posed = suspect & found.used
+    posed = (suspect | doubtful) & found.used
     if posed.any():
         present[posed] = unexplained(single_views(scene, points, posed, sigma), invert(found.c2w[posed]))
     misfit = _misfits(attempt)
-    c2w, cost, swapped = locate_views(scene, points, suspect & misfit, sigma)
+    c2w, cost, swapped = locate_views(scene, points, suspect & misfit | doubtful, sigma)
     mirror = scene.with_sides_swapped(np.ones_like(suspect))
     fitting = suspect & ~misfit
     if fitting.any():
         exchanged = locate(single_views(mirror, points, fitting, sigma))
         c2w[fitting], swapped[fitting] = invert(exchanged.w2c), True
         cost[fitting] = np.where(exchanged.cost < SWAP_GAIN * present[fitting], exchanged.cost, math.inf)
-    better = suspect & (cost < present)
+    gain = np.where(doubtful, _CLEAR_GAIN / np.maximum(scene.seen.sum(1), 1), 0.0)
+    better = (suspect | doubtful) & (cost < present - gain)
     used = np.where(better, cost < LOST, found.used & (attempt.agreeing | ~suspect))
     if not better.any() and np.array_equal(used, found.used):
         return None

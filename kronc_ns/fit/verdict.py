@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from kronc_ns.fit.attempts import agrees
+from kronc_ns.fit.noise import Noise
 from kronc_ns.fit.starts import MIN_POINTS
 from kronc_ns.geometry.camera import Camera, reproject
 from kronc_ns.geometry.poses import posed, unit
@@ -17,8 +19,17 @@ from kronc_ns.solve.robust import INLIER_SIGMAS, noise_px
 MIN_VIEWS = 3
 POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
-_VAGUE_DEG = 5.0
-"""A median standard deviation of the rotations above this is close to degenerate."""
+_NOISY = 0.006
+"""Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
+_LEAST_FREEDOM = 10
+"""Measurements beyond the unknowns without which a fit tells nothing of its noise."""
+_SURE_DEG, _SURE_SHARE = 2.0, 0.06
+"""Most standard deviation of a solved view's rotation, and of its centre as a share of the distance: with more, errors
+of 5 degrees are no rarity."""
+_LEAST_LEAD = 3.0
+"""Detections by which a solved view's pose is better than any other."""
+_LEAST_SOLVED = 0.25
+"""Share of views without which the others' poses are not believed."""
 _PARALLAX_DEG = 3.0
 """Views that see the points from within this angle hardly tell how far these are."""
 _ALIKE = 0.005
@@ -41,11 +52,15 @@ class Evidence:
     sigma_rot_deg: Float[np.ndarray, "n"]
     sigma_trans_m: Float[np.ndarray, "n"]
     swapped: Bool[np.ndarray, "n"]
+    lead: Float[np.ndarray, "n"]
+    """By how many detections each view's pose is better than any other (`doubt.lead`)."""
     shape_weight: float | None
     """How usual a car the points make, 1 to 0; None without a template."""
     converged: bool
     """Whether the solver came to rest within its steps."""
     iterations: int
+    noise: Noise
+    """Of the detections."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +74,8 @@ class Verdict:
     """Root mean square reprojection error over all inliers of solved views; NaN where there is none."""
     median_px: float
     """Median reprojection error over all detections in solved views; NaN where there is none."""
+    vague: Bool[np.ndarray, "n"]
+    """Views that agree with the others, but are not placed well enough to count as solved."""
 
     @property
     def solved(self) -> Bool[np.ndarray, "n"]:
@@ -95,49 +112,81 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     counted, found, good = (~np.isnan(error)).sum(1), scene.seen.sum(1), inlier.sum(1)
     rmse = np.sqrt(np.where(inlier, error**2, 0.0).sum(1) / np.maximum(good, 1))
     agree = agrees(good, counted)
-    numbers = (x.tolist() for x in (found, counted, good, agree, rmse))
-    views = tuple(
-        _report(name, *rest, of=evidence, i=i)
-        for i, (name, *rest) in enumerate(zip(scene.names, *numbers, strict=True))
-    )
+    distance = _distance(evidence)
+    sure = (evidence.sigma_rot_deg <= _SURE_DEG) & (evidence.sigma_trans_m <= _SURE_SHARE * distance)
+    alone = evidence.lead >= _LEAST_LEAD
+    columns = (x.tolist() for x in (found, counted, good, agree, alone, sure, rmse))
+    facts = (_Facts(*row) for row in zip(*columns, strict=True))
+    views = tuple(_report(name, of, evidence, i) for i, (name, of) in enumerate(zip(scene.names, facts, strict=True)))
     solved = np.array([view.status is ViewStatus.SOLVED for view in views], dtype=bool)
     kept = inlier & solved[:, None]
     of_solved = error[solved][~np.isnan(error[solved])]
     finite = error[np.isfinite(error)]
     median = float(np.median(finite)) if len(finite) else math.inf
-    status, reason = _overall(scene, evidence, solved, kept, median)
+    vague = agree & alone & ~sure
+    status, reason = _overall(scene, evidence, solved, agree, median)
     return Verdict(
         views,
         status,
         reason,
         float(np.sqrt(np.where(kept, error**2, 0.0).sum() / max(kept.sum(), 1))),
         float(np.median(of_solved)) if len(of_solved) else math.nan,
+        vague,
     )
 
 
-def _report(name: str, found: int, seen: int, good: int, agree: bool, rmse: float, of: Evidence, i: int) -> ViewReport:
+class _Facts(NamedTuple):
+    """Of one view."""
+
+    found: int
+    """Keypoints."""
+    seen: int
+    """Of those, how many are of solved points."""
+    good: int
+    """Of those, how many agree."""
+    agree: bool
+    alone: bool
+    """Whether no other pose fits nearly as well."""
+    sure: bool
+    """Whether the standard deviations are small enough."""
+    rmse: float
+
+
+def _report(name: str, of: _Facts, evidence: Evidence, i: int) -> ViewReport:
+    rotation, centre = known(evidence.sigma_rot_deg[i]), known(evidence.sigma_trans_m[i])
     reason = ""
-    if found < MIN_POINTS:
-        reason = f"{found} keypoints, at least {MIN_POINTS} are needed"
-    elif seen == 0:
-        reason = f"no pose was found that agrees with its {found} keypoints"
-    elif not agree:
-        reason = f"only {good} of {seen} keypoints agree with the other views"
+    if of.found < MIN_POINTS:
+        reason = f"{of.found} keypoints, at least {MIN_POINTS} are needed"
+    elif of.seen == 0:
+        reason = f"no pose was found that agrees with its {of.found} keypoints"
+    elif not of.agree:
+        reason = f"only {of.good} of {of.seen} keypoints agree with the other views"
+    elif not of.alone:
+        reason = f"its {of.seen} keypoints fit another pose nearly as well"
+    elif not of.sure:
+        spread = "unknown" if rotation is None or centre is None else f"{rotation:.1f} deg, {centre:.2g} m"
+        reason = f"the {of.good} keypoints that agree do not place it well (standard deviation {spread})"
     if reason:
-        return ViewReport(name, ViewStatus.FAILED, found, good, None, reason=reason)
-    rotation, centre = _known(of.sigma_rot_deg[i]), _known(of.sigma_trans_m[i])
-    return ViewReport(name, ViewStatus.SOLVED, found, good, rmse, rotation, centre, swapped=bool(of.swapped[i]))
+        return ViewReport(name, ViewStatus.FAILED, of.found, of.good, None, reason=reason)
+    swapped = bool(evidence.swapped[i])
+    return ViewReport(name, ViewStatus.SOLVED, of.found, of.good, of.rmse, rotation, centre, swapped=swapped)
 
 
-def _known(value: float) -> float | None:
+def known(value: float) -> float | None:
+    """A number for a report; None where it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
 def _overall(
-    scene: Scene, evidence: Evidence, solved: Bool[np.ndarray, "n"], kept: Bool[np.ndarray, "n j"], median_px: float
+    scene: Scene,
+    evidence: Evidence,
+    solved: Bool[np.ndarray, "n"],
+    agreeing: Bool[np.ndarray, "n"],
+    median_px: float,
 ) -> tuple[Status, str]:
     share = median_px / _diagonal(scene)
-    count, views, with_template = int(solved.sum()), len(scene), evidence.shape_weight is not None
+    count, sure, views = int(agreeing.sum()), int(solved.sum()), len(scene)
+    with_template = evidence.shape_weight is not None
     fit = f"median reprojection error {median_px:.2f} px ({100 * share:.2f} % of the image diagonal)"
     if not math.isfinite(median_px):
         fit = "no detection meets a solved point"
@@ -145,35 +194,40 @@ def _overall(
         return Status.FAILED, f"{count} of {views} views agree with each other, expected at least {MIN_VIEWS}; {fit}"
     if share > POOR_FIT:
         return Status.FAILED, f"the keypoints do not fit together: {fit}, expected below {100 * POOR_FIT:g} %"
-    sigmas = evidence.sigma_rot_deg[solved]
-    vague = float(np.median(sigmas[~np.isnan(sigmas)])) if not np.isnan(sigmas).all() else math.nan
     problems = []
     if not evidence.converged:
         problems.append(f"the solver was still moving after {evidence.iterations} steps: allow more")
     if count < MIN_VIEWS:
         problems.append(f"only {count} view{'s' * (count > 1)}: nothing but the car template holds them together")
-    elif not _redundant(kept):
+    elif evidence.noise.freedom < _LEAST_FREEDOM:
         problems.append("the views share so few keypoints that any poses would meet them: take more views")
-    if share > POOR_FIT / 2:
-        problems.append("the keypoints fit poorly")
+    if evidence.noise.sigma_px > _NOISY * _diagonal(scene):
+        problems.append(
+            f"the keypoints fit poorly (noise {evidence.noise.sigma_px:.1f} px): are they all of one car, and right?"
+        )
     if 2 * count < views:
         problems.append(f"only {count} of {views} views are solved")
-    if count > 1 and (_parallax_deg(evidence, solved) < _PARALLAX_DEG or _all_alike(scene, solved)):
+    elif sure < max(MIN_VIEWS, _LEAST_SOLVED * views):
+        sigma = evidence.sigma_rot_deg[agreeing]
+        typical = float(np.median(sigma[np.isfinite(sigma)])) if np.isfinite(sigma).any() else math.nan
+        problems.append(
+            f"only {sure} of {views} views are well determined (median standard deviation {typical:.1f} deg): "
+            "take more views, or from nearer"
+        )
+    if count > 1 and (_parallax_deg(evidence, agreeing) < _PARALLAX_DEG or _all_alike(scene, agreeing)):
         problems.append("all views are from the same place: take them from around the object")
-    if not vague <= _VAGUE_DEG:
-        problems.append(f"the views are barely determined (median standard deviation {vague:.1f} deg): take more views")
     if evidence.shape_weight is not None and evidence.shape_weight < _ODD_SHAPE:
         problems.append("the points hardly look like a car: are the keypoints in the schema's order?")
     if problems:
         return Status.WEAK, f"{'; '.join(problems)}; {fit}"
-    return Status.CONVERGED, f"{count} of {views} views solved; {fit}"
+    return Status.CONVERGED, f"{sure} of {views} views solved; {fit}"
 
 
-def _redundant(kept: Bool[np.ndarray, "n j"]) -> bool:
-    """Whether the detections that agree are more than what they determine: poses and points, but for the gauge."""
-    shared = kept & (kept.sum(0) >= 2)
-    views, points = int(shared.any(1).sum()), int(shared.any(0).sum())
-    return 2 * int(shared.sum()) > 6 * views + 3 * points - 7
+def _distance(evidence: Evidence) -> Float[np.ndarray, "n"]:
+    """Of each camera from the middle of the points."""
+    known = np.isfinite(evidence.points).all(-1)
+    middle = evidence.points[known].mean(0) if known.any() else np.zeros(3)
+    return np.linalg.norm(evidence.c2w[..., 3] - middle, axis=-1)
 
 
 def _parallax_deg(evidence: Evidence, solved: Bool[np.ndarray, "n"]) -> float:

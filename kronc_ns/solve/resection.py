@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from kronc_ns.geometry.poses import look_at, make_pose, unit
-from kronc_ns.geometry.rotations import so3_exp
+from kronc_ns.geometry.rotations import rotation_angle_deg, so3_exp
 from kronc_ns.solve.compiled import compiled
 from kronc_ns.solve.linear import dot, exponential, inverse_factor
 from kronc_ns.solve.projection import BEHIND_PX, NEAR, pixel, pixel_by_plane, plane_by_shift, plane_by_turn
@@ -27,6 +27,8 @@ _ELEVATIONS_DEG = (-5.0, 15.0, 35.0, 60.0)
 _ROLLS_DEG = (0.0, 90.0, 180.0, 270.0)
 _ROUNDS = ((4, 4), (2, 5), (1, 8))
 """How many guesses of a view go through each round of refinement, and the steps of the round."""
+_RIVALS = 6
+"""Guesses of a view that are refined to find the second best."""
 _BEHIND = 1.3
 """A view whose rival leaves so many times less unexplained after the first round is given up."""
 _START_DAMPING = 1e-3
@@ -86,6 +88,16 @@ def locate(views: Views, exact: bool = False, rival: Int[np.ndarray, "m"] | None
     poses, cost = np.full((number, 3, 4), np.nan), np.full(number, np.inf)
     poses[view[chosen]], cost[view[chosen]] = w2c[chosen], unexplained[chosen]
     return Located(poses, cost)
+
+
+def runner_up(views: Views, w2c: Float[np.ndarray, "m 3 4"], apart_deg: float) -> Float[np.ndarray, "m"]:
+    """`Located.cost` of the best other pose of each view, turned by more than ``apart_deg`` from the one given."""
+    number, rows = len(views.uv), _rows(views)
+    view, others = np.repeat(np.arange(number), _RIVALS), _best_guesses(views, _RIVALS).reshape(-1, 3, 4)
+    others, cost = _refined(rows, view, others, views.tolerance_px / 3, sum(steps for _, steps in _ROUNDS))
+    turned = rotation_angle_deg(others[..., :3].swapaxes(-1, -2) @ w2c[view][..., :3])
+    cost = np.where(np.isfinite(cost) & (turned > apart_deg), cost, np.inf)
+    return cost.reshape(number, _RIVALS).min(1)
 
 
 def unexplained(views: Views, w2c: Float[np.ndarray, "m 3 4"]) -> Float[np.ndarray, "m"]:

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from kronc_ns.fit.completion import complete
+from kronc_ns.fit.noise import Noise
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.fit.verdict import Evidence, judge
@@ -77,6 +78,8 @@ def evidence_of(solution: Solution) -> Evidence:
         shape_weight=1.0,
         converged=True,
         iterations=10,
+        lead=np.full(len(solution.views), np.inf),
+        noise=Noise(1.0, 1.0, 500),
     )
 
 
@@ -93,6 +96,23 @@ def test_where_all_is_solved_or_nothing_nothing_is_placed(scene, solution):
     c2w, views = complete(scene, nowhere, verdict)
     assert np.isnan(c2w).all()
     assert views == verdict.views
+
+
+def test_a_vague_view_keeps_its_own_pose_where_the_walk_does_not_tell_it_better(scene, solution):
+    """Of two vague views one is surer than the walk between its neighbours, the other is not."""
+    evidence = evidence_of(solution)
+    rotation = evidence.sigma_rot_deg.copy()
+    rotation[[5, 12]] = 2.0, 90.0
+    vague = replace(evidence, sigma_rot_deg=rotation)
+    verdict = judge(scene, vague)
+    c2w, views = complete(scene, vague, verdict)
+    assert [i for i, view in enumerate(views) if view.status is ViewStatus.COMPLETED] == [5, 12]
+    assert_array_equal(c2w[5], solution.c2w[5])
+    assert views[5].sigma_rot_deg == pytest.approx(2.0)
+    assert "standard deviation 2.0 deg" in views[5].reason
+    assert not np.array_equal(c2w[12], solution.c2w[12])
+    assert views[12].reason.startswith("placed between its neighbours: ")
+    assert views[12].sigma_rot_deg < 30
 
 
 @pytest.fixture(scope="module")

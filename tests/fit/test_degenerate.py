@@ -175,7 +175,8 @@ def test_a_single_view_of_a_car_is_placed_by_the_template():
     solution = solve_scene(scene)
     assert solution.status is Status.WEAK
     assert "template" in solution.reason
-    assert solution.views_that_are(ViewStatus.SOLVED).tolist() == [i == 3 for i in range(VIEWS)]
+    assert solution.views_that_are(ViewStatus.COMPLETED).tolist() == [i == 3 for i in range(VIEWS)]
+    assert solution.posed.tolist() == [i == 3 for i in range(VIEWS)]
     assert np.linalg.norm(solution.c2w[3, :, 3] - CAPTURE.c2w[3, :, 3]) < 0.8
 
 

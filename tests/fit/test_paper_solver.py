@@ -111,7 +111,7 @@ def test_same_seed_same_bits_and_the_seed_matters(noisy):
 
 def test_given_depths_speed_up_and_can_be_fixed(noisy, walk_capture):
     scene = replace(noisy, given_depths=camera_z(walk_capture.c2w, walk_capture.points))
-    few = KroncConfig(solver="adam", adam=AdamConfig(steps=300))
+    few = KroncConfig(solver="adam", adam=AdamConfig(steps=600))
 
     def centre_error(depth_init: str) -> float:
         solution = solve_scene(scene, replace(few, depth_init=depth_init))

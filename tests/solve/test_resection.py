@@ -14,7 +14,7 @@ from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.keypoints.template import car_template
 from kronc_ns.solve import resection
 from kronc_ns.solve.problem import State
-from kronc_ns.solve.resection import Located, Views, locate, unexplained
+from kronc_ns.solve.resection import Located, Views, locate, runner_up, unexplained
 from tests.solve.problems import FOCAL, projections, randn
 
 TEMPLATE = car_template(APOLLOCAR3D_66)
@@ -165,6 +165,28 @@ def test_what_a_given_pose_leaves_unexplained():
     np.testing.assert_allclose(unexplained(aside, invert(c2w)), expected, rtol=1e-6)
     nowhere = np.where(np.arange(12)[:, None, None] == 3, np.nan, invert(c2w))
     np.testing.assert_allclose(unexplained(exact, nowhere), np.arange(12) == 3, atol=1e-6)
+
+
+def test_the_second_best_pose_of_many_points_in_space_is_far_worse():
+    c2w = circular_poses(8)
+    views = of_the_car(c2w)
+    assert unexplained(views, invert(c2w)).max() < 0.1
+    assert runner_up(views, invert(c2w), 10.0).min() > 0.3
+
+
+def test_a_few_points_of_a_plane_far_away_are_met_from_two_sides():
+    """Necker's reversal: seen from afar a plane leans this way or that."""
+    plane = 0.3 * np.array([[x, 0.0, z] for x in (-1, 0, 1) for z in (-1, 0, 1)])
+    c2w = look_at(np.array([[3.0, 9.0, 2.0]]), np.zeros((1, 3)), np.array([0.0, 0.0, 1.0]))
+    views = views_of(plane, c2w)
+    assert runner_up(views, invert(c2w), 10.0)[0] < 0.2
+
+
+def test_a_pose_is_no_rival_of_itself():
+    views = of_the_car(circular_poses(4), noise_px=0.0)
+    w2c = invert(circular_poses(4))
+    assert runner_up(views, w2c, -1.0) == pytest.approx(0.0, abs=1e-6)  # without a distance it is found again
+    assert runner_up(views, w2c, 10.0).min() > 0.3
 
 
 def test_unknown_points_are_ignored():

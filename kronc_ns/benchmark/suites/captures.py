@@ -46,7 +46,7 @@ class Shapes:
     def __call__(self, seed: int) -> Float[np.ndarray, "66 3"]:
         """Keypoints of the seed's car: report seeds only ever meet held-out shapes."""
         shapes = self.report if seed < REPORT_SEEDS else self.tuning
-        return shapes[seed % len(shapes)] if shapes else _random_car(seed)
+        return shapes[seed % len(shapes)] if shapes else random_car(seed)
 
     def __str__(self) -> str:
         return f"{len(self.report)} held-out car shapes" if self.report else "random procedural cars"
@@ -85,7 +85,8 @@ def load_shapes(path: Path) -> Shapes:
 
 
 @lru_cache(maxsize=256)
-def _random_car(seed: int) -> Float[np.ndarray, "66 3"]:
+def random_car(seed: int) -> Float[np.ndarray, "66 3"]:
+    """Keypoints of a procedural car in any proportions."""
     return build_car(CarShape.random(np.random.default_rng(seed))).keypoints
 
 

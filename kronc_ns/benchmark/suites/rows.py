@@ -48,6 +48,8 @@ class Limit:
     statistic: Statistic = "mean"
     at_most: float = math.inf
     at_least: float = -math.inf
+    percent_of: str = ""
+    """With this, the figure's total is asked as a percentage of this figure's total."""
 
     def __str__(self) -> str:
         least = f"{self.at_least:g} <= " if self.at_least > -math.inf else ""
@@ -58,11 +60,14 @@ class Limit:
     @property
     def name(self) -> str:
         """Of what is reached."""
-        return named(self.figure, self.statistic)
+        return f"{self.figure}_percent" if self.percent_of else named(self.figure, self.statistic)
 
     def reached(self, seeds: Sequence[Figures]) -> float:
         """The statistic over the seeds that have the figure; one that could not be solved is infinitely bad."""
         large_is_bad = self.at_most < math.inf
+        if self.percent_of:
+            whole = sum(one.get(self.percent_of, 0.0) for one in seeds)
+            return 100 * sum(one.get(self.figure, 0.0) for one in seeds) / whole if whole else math.nan
         bad = math.inf if large_is_bad else -math.inf
         values = [one.get(self.figure, bad) for one in seeds if self.figure in one or "failed" in one]
         return summary(values, self.statistic, large_is_bad)
