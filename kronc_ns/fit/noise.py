@@ -39,7 +39,8 @@ def believed_noise(
 ) -> Noise:
     """The noise of a fit's inliers; detections of points that no other view sees are met anyhow and do not count."""
     counted = inlier & (inlier.sum(0) >= 2)
-    unknown = 6 * int(counted.any(1).sum()) + 3 * int(counted.any(0).sum()) - 7 + len(problem.refine)
+    unknown = 6 * int(counted.any(1).sum()) + 3 * int(counted.any(0).sum()) - 7
+    unknown += problem.lenses * len(problem.refine)
     freedom = 2 * int(counted.sum()) - unknown
     squares = float((problem.weight[counted] * np.square(error_px[counted])).sum())
     known = max(freedom, 0) + _FREEDOM

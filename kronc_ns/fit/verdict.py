@@ -23,7 +23,7 @@ _NOISY = 0.006
 """Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
 _LEAST_FREEDOM = 10
 """Measurements beyond the unknowns without which a fit tells nothing of its noise."""
-_SURE_DEG, _SURE_SHARE = 2.0, 0.06
+_SURE_DEG, _SURE_SHARE = 2.0, 0.03
 """Most standard deviation of a solved view's rotation, and of its centre as a share of the distance: with more, errors
 of 5 degrees are no rarity."""
 _LEAST_LEAD = 3.0

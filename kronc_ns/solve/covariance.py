@@ -37,6 +37,7 @@ def camera_covariance(
         problem.focal,
         problem.shape,
         refine=problem.refine,
+        lens=problem.lens,
     )
     data = records.measured(chosen)
     now, work = records.estimate(data, state), records.system(data, *chosen.weight.shape, with_cameras=True)

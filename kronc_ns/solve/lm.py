@@ -107,5 +107,7 @@ def is_ready() -> bool:
 
 
 def _state(now: records.Estimate) -> State:
-    log_growth, k1 = now.intrinsics.tolist()
-    return State(now.rotation.copy(), now.translation.copy(), now.points.copy(), log_growth, k1)
+    poses = now.rotation.copy(), now.translation.copy(), now.points.copy()
+    if len(now.intrinsics) == 1:
+        return State(*poses, *now.intrinsics[0].tolist())
+    return State(*poses, *now.intrinsics.T.copy())

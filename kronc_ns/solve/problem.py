@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from kronc_ns.geometry.poses import invert, make_pose
 from kronc_ns.solve.robust import REDUNDANCY_MOST
@@ -56,9 +56,16 @@ class Problem:
     shape: ShapePrior | None = None
     orbit: OrbitPrior | None = None
     refine: tuple[Intrinsic, ...] = ()
-    """Shared intrinsics that are unknown too."""
+    """Intrinsics that are unknown too, of every lens."""
+    lens: Int[np.ndarray, "n"] | None = None
+    """By which lens each view was taken, from 0 on; None: all by one."""
     points_known: bool = False
     """Whether only the cameras are sought."""
+
+    @property
+    def lenses(self) -> int:
+        """How many there are."""
+        return 1 if self.lens is None else int(self.lens.max(initial=0)) + 1
 
     @property
     def redundancy(self) -> float:
@@ -79,10 +86,10 @@ class State:
     translation: Float[np.ndarray, "n 3"]
     """World to camera."""
     points: Float[np.ndarray, "j 3"]
-    log_growth: float = 0.0
-    """Logarithm of the factor of the focal length."""
-    k1: float = 0.0
-    """First radial distortion coefficient, beyond what the pixels have been undistorted by."""
+    log_growth: float | Float[np.ndarray, "g"] = 0.0
+    """Logarithm of the factor of the focal length; of each lens where there are several."""
+    k1: float | Float[np.ndarray, "g"] = 0.0
+    """First radial distortion coefficient, beyond what the pixels have been undistorted by; likewise."""
 
     @property
     def c2w(self) -> Float[np.ndarray, "n 3 4"]:

@@ -27,6 +27,8 @@ class Measured(NamedTuple):
     """[K] weight"""
     focal: Array
     """[2]"""
+    lens: Array
+    """[N] which of G lenses"""
     mean: Array
     """[3J] of the shape prior"""
     precision: Array
@@ -51,7 +53,7 @@ class Estimate(NamedTuple):
     points: Array
     """[J, 3]"""
     intrinsics: Array
-    """[2]: logarithm of the focal length's factor, k1"""
+    """[G, 2]: logarithm of the focal length's factor, k1"""
     seen: Array
     """[3, K]: place in the image plane, 1 / z"""
     error: Array
@@ -94,6 +96,7 @@ def measured(problem: Problem) -> Measured:
         np.ascontiguousarray(problem.uv[view, joint].T),
         problem.weight[view, joint],
         np.array(problem.focal),
+        np.zeros(views, np.int64) if problem.lens is None else problem.lens.astype(np.int64),
         np.empty(0) if shape is None else np.ascontiguousarray(shape.mean),
         np.empty((0, 0)) if shape is None else np.ascontiguousarray(shape.precision),
         1.0 if shape is None else shape.freedom,
@@ -112,7 +115,7 @@ def estimate(data: Measured, state: State) -> Estimate:
         np.array(state.rotation, order="C"),
         np.array(state.translation, order="C"),
         np.array(state.points, order="C"),
-        np.array([state.log_growth, state.k1]),
+        _intrinsics(data, state),
         np.empty((3, count)),
         np.empty((2, count)),
         np.empty(count),
@@ -123,7 +126,8 @@ def estimate(data: Measured, state: State) -> Estimate:
 
 def system(data: Measured, views: int, joints: int, with_cameras: bool = False) -> System:
     """Room for the system of a problem; ``with_cameras`` where the cameras' rows are wanted, too."""
-    size = (0 if data.points_known else 3 * joints) + data.with_focal + data.with_k1
+    lenses = int(data.lens.max(initial=0)) + 1
+    size = (0 if data.points_known else 3 * joints) + lenses * (data.with_focal + data.with_k1)
     return System(
         np.empty(len(data.joint)),
         np.empty(len(data.joint)),
@@ -132,3 +136,10 @@ def system(data: Measured, views: int, joints: int, with_cameras: bool = False) 
         np.empty((size, size)),
         np.empty(size),
     )
+
+
+def _intrinsics(data: Measured, state: State) -> Array:
+    """Of every lens; a single number is that of all."""
+    values = np.empty((int(data.lens.max(initial=0)) + 1, 2))
+    values[:, 0], values[:, 1] = state.log_growth, state.k1
+    return values

@@ -32,10 +32,10 @@ TINY = 1e-12
 @compiled_briefly
 def evaluate(data: Measured, now: Estimate) -> None:
     """Reproject all points, and see how unusual they are: everything in ``now`` that follows from its unknowns."""
-    growth, k1 = np.exp(now.intrinsics[0]), now.intrinsics[1]
-    fx, fy = data.focal[0] * growth, data.focal[1] * growth
     for n in range(len(now.rotation)):
-        r, t = now.rotation[n], now.translation[n]
+        r, t, lens = now.rotation[n], now.translation[n], now.intrinsics[data.lens[n]]
+        growth, k1 = np.exp(lens[0]), lens[1]
+        fx, fy = data.focal[0] * growth, data.focal[1] * growth
         for k in range(data.first[n], data.first[n + 1]):
             j = data.joint[k]
             x, y, z = now.points[j, 0], now.points[j, 1], now.points[j, 2]
@@ -110,7 +110,7 @@ def reduce_system(data: Measured, now: Estimate, work: System, damping: float, b
     matrix, rhs = work.matrix, work.rhs
     size, joints = len(rhs), len(now.points)
     shared = int(data.with_focal) + int(data.with_k1)
-    points = size - shared
+    points = size - shared * len(now.intrinsics)
     most = 0
     for n in range(len(now.rotation)):
         most = max(most, data.first[n + 1] - data.first[n])
@@ -157,8 +157,9 @@ def reduce_system(data: Measured, now: Estimate, work: System, damping: float, b
                     for d in range(c + 1):
                         square = rows[c, k] * rows[d, k] + rows[c, count + k] * rows[d, count + k]
                         matrix[i, columns[d * count + k]] += square
+        own = points + shared * data.lens[n]  # of the view's lens
         for s in range(shared):
-            row, i = lens[s], points + s
+            row, i = lens[s], own + s
             columns[width + s] = i
             rhs[i] -= dot(row, off, 2 * count)
             for p in range(6):
@@ -168,7 +169,7 @@ def reduce_system(data: Measured, now: Estimate, work: System, damping: float, b
                     product = rows[c, k] * row[k] + rows[c, count + k] * row[count + k]
                     matrix[i, columns[c * count + k]] += product
             for d in range(s + 1):
-                matrix[i, points + d] += dot(row, lens[d], 2 * count)
+                matrix[i, own + d] += dot(row, lens[d], 2 * count)
             diagonal[i] += dot(row, row, 2 * count)
         width += shared
         for p in range(6):
@@ -221,9 +222,10 @@ def step(data: Measured, now: Estimate, to: Estimate, work: System, variance: fl
     for j in range(joints):
         for c in range(3):
             to.points[j, c] = now.points[j, c] + (change[c * joints + j] if points else 0.0)
-    to.intrinsics[0], to.intrinsics[1] = now.intrinsics[0], now.intrinsics[1]
-    for s in range(shared):
-        to.intrinsics[0 if data.with_focal and s == 0 else 1] += change[points + s]
+    for g in range(len(now.intrinsics)):
+        to.intrinsics[g, 0], to.intrinsics[g, 1] = now.intrinsics[g, 0], now.intrinsics[g, 1]
+        for s in range(shared):
+            to.intrinsics[g, 0 if data.with_focal and s == 0 else 1] += change[points + shared * g + s]
     for n in range(len(now.rotation)):
         r, t, w = now.rotation[n], now.translation[n], work.whitener[n]
         begin, count = data.first[n], data.first[n + 1] - data.first[n]
@@ -235,8 +237,9 @@ def step(data: Measured, now: Estimate, to: Estimate, work: System, variance: fl
                     off[k] += rows[c, k] * moved
                     off[count + k] += rows[c, count + k] * moved
         for s in range(shared):
+            moved = change[points + shared * data.lens[n] + s]
             for k in range(2 * count):
-                off[k] += lens[s, k] * change[points + s]
+                off[k] += lens[s, k] * moved
         for p in range(6):
             right[p] = dot(a[p], off, 2 * count)
         if len(data.strength):
@@ -263,7 +266,8 @@ def fill_rows(data: Measured, now: Estimate, weight: Any, n: int, a: Any, rows: 
     By the camera a [6, 2 count], by the point rows [3, 2 count], by the refined intrinsics lens [K, 2 count];
     off [2 count].
     """
-    growth, k1, r = np.exp(now.intrinsics[0]), now.intrinsics[1], now.rotation[n]
+    g, r = data.lens[n], now.rotation[n]
+    growth, k1 = np.exp(now.intrinsics[g, 0]), now.intrinsics[g, 1]
     fx, fy = data.focal[0] * growth, data.focal[1] * growth
     begin, count = data.first[n], data.first[n + 1] - data.first[n]
     for k in range(count):

@@ -1,7 +1,7 @@
 """The solver's equations by the book: residuals in torch, derivatives by autograd, systems dense.
 
 Unknowns in a row: 6 of each camera (turn w and shift t of p -> exp(w) p + t), the points' (x of all, y of all, z of
-all; none where they are known), the refined intrinsics (logarithm of the focal length's factor, then k1).
+all; none where they are known), the refined intrinsics of each lens (logarithm of the focal length's factor, then k1).
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from kronc_ns.solve.problem import Problem, State
 def unknowns(problem: Problem) -> tuple[int, int, int]:
     """How many of the cameras, the points and the intrinsics."""
     views, joints = problem.weight.shape
-    return 6 * views, 0 if problem.points_known else 3 * joints, len(problem.refine)
+    return 6 * views, 0 if problem.points_known else 3 * joints, problem.lenses * len(problem.refine)
 
 
 def nowhere(problem: Problem) -> Tensor:
@@ -25,7 +25,7 @@ def nowhere(problem: Problem) -> Tensor:
 
 
 def after(problem: Problem, state: State, change: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """(rotation, translation, points, log_growth, k1) after a change of the unknowns."""
+    """(rotation, translation, points, log_growth, k1) after a change of the unknowns; the last two of each lens."""
     cameras, points, intrinsics = change.split(unknowns(problem))
     w, t = cameras.view(-1, 6).split(3, dim=1)
     x, y, z, o = *w.unbind(1), torch.zeros_like(w[:, 0])
@@ -34,14 +34,14 @@ def after(problem: Problem, state: State, change: Tensor) -> tuple[Tensor, Tenso
     world = torch.from_numpy(state.points)
     if not problem.points_known:
         world = world + points.view(3, -1).T
-    none = torch.zeros((), dtype=torch.float64)
-    by_name = dict(zip(sorted(problem.refine), intrinsics, strict=True))
+    none = torch.zeros(problem.lenses, dtype=torch.float64)
+    by_name = dict(zip(sorted(problem.refine), intrinsics.view(problem.lenses, -1).unbind(1), strict=True))
     return (
         turn @ rotation,
         (turn @ translation[..., None])[..., 0] + t,
         world,
-        state.log_growth + by_name.get("focal", none),
-        state.k1 + by_name.get("k1", none),
+        torch.as_tensor(state.log_growth, dtype=torch.float64) + by_name.get("focal", none),
+        torch.as_tensor(state.k1, dtype=torch.float64) + by_name.get("k1", none),
     )
 
 
@@ -49,6 +49,8 @@ def reprojection(problem: Problem, state: State, change: Tensor | None = None) -
     """Projection minus detection in pixels, [n, j, 2]."""
     change = nowhere(problem) if change is None else change
     rotation, translation, points, log_growth, k1 = after(problem, state, change)
+    lens = torch.zeros(len(rotation), dtype=torch.long) if problem.lens is None else torch.from_numpy(problem.lens)
+    log_growth, k1 = (of[lens][:, None, None] for of in (log_growth, k1))
     camera = points @ rotation.mT + translation[:, None]
     plane = camera[..., :2] / camera[..., 2:]
     bent = plane * (1 + k1 * plane.square().sum(-1, keepdim=True))
@@ -109,4 +111,7 @@ def step(
 def moved_by(problem: Problem, state: State, change: np.ndarray) -> State:
     """The state after a change of the unknowns."""
     rotation, translation, points, log_growth, k1 = after(problem, state, torch.from_numpy(change))
-    return State(rotation.numpy(), translation.numpy(), points.numpy(), float(log_growth), float(k1))
+    poses = rotation.numpy(), translation.numpy(), points.numpy()
+    if problem.lenses == 1:
+        return State(*poses, float(log_growth), float(k1))
+    return State(*poses, log_growth.numpy(), k1.numpy())

@@ -28,6 +28,11 @@ VARIANTS = {
     "points known, focal": ("known", "focal", "orbit"),
     "everything": ("k1", "focal", "shape", "orbit"),
 }
+SEVERAL_LENSES = {
+    "two lenses": ("focal", "k1", "lenses"),
+    "two lenses, everything": ("k1", "focal", "shape", "orbit", "lenses"),
+}
+"""What the solver for a GPU does not know."""
 BELIEF, VARIANCE = 0.7, 2.3
 """Weights of the shape prior and of expected centres."""
 
@@ -110,7 +115,7 @@ def orbit_prior(truth: State) -> OrbitPrior:
 
 def posed(variant: str, views: int = 4, joints: int = 6) -> tuple[Problem, State, np.ndarray]:
     """A problem, a state off the solution with a bent lens, and weights of all detections."""
-    options = VARIANTS[variant]
+    options = {**VARIANTS, **SEVERAL_LENSES}[variant]
     problem, truth = scene(views, joints, noise_px=2.0)
     problem = replace(
         problem,
@@ -118,6 +123,8 @@ def posed(variant: str, views: int = 4, joints: int = 6) -> tuple[Problem, State
         shape=shape_prior(joints) if "shape" in options else None,
         orbit=orbit_prior(truth) if "orbit" in options else None,
         points_known="known" in options,
+        lens=np.arange(views) % 2 if "lenses" in options else None,
     )
-    state = replace(started(truth), log_growth=0.1, k1=-0.07)
+    of_lens = {"log_growth": np.array([0.1, -0.05]), "k1": np.array([-0.07, 0.02])}
+    state = replace(started(truth), **(of_lens if "lenses" in options else {"log_growth": 0.1, "k1": -0.07}))
     return problem, state, problem.weight * np.random.default_rng(5).random(problem.weight.shape)

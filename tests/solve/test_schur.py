@@ -13,6 +13,7 @@ from tests.solve import book
 from tests.solve.problems import (
     BELIEF,
     HALF_TURN,
+    SEVERAL_LENSES,
     SIMILARITY,
     VARIANCE,
     VARIANTS,
@@ -27,6 +28,11 @@ from tests.solve.problems import (
 )
 
 
+def state_of(now: records.Estimate) -> State:
+    lenses = now.intrinsics[0].tolist() if len(now.intrinsics) == 1 else now.intrinsics.T
+    return State(now.rotation, now.translation, now.points, *lenses)
+
+
 class Step:
     """A step of the compiled solver."""
 
@@ -39,7 +45,7 @@ class Step:
         lower = np.tril(self.work.matrix)
         self.matrix, self.rhs = lower + np.tril(lower, -1).T, self.work.rhs.copy()
         self.solved = schur.step(data, self.now, self.to, self.work, VARIANCE)
-        self.state = State(self.to.rotation, self.to.translation, self.to.points, *self.to.intrinsics.tolist())
+        self.state = state_of(self.to)
 
 
 def assert_alike(ours: State, theirs: State, rtol: float = 1e-7, atol: float = 1e-9) -> None:
@@ -47,7 +53,7 @@ def assert_alike(ours: State, theirs: State, rtol: float = 1e-7, atol: float = 1
         np.testing.assert_allclose(getattr(ours, name), value, rtol=rtol, atol=atol, err_msg=name)
 
 
-@pytest.mark.parametrize("variant", ["plain", "focal", "k1", "focal and k1"])
+@pytest.mark.parametrize("variant", ["plain", "focal", "k1", "focal and k1", "two lenses"])
 def test_the_rows_of_every_view_are_the_derivatives_of_its_projections(variant):
     """Focal lengths differ and the lens bends."""
     problem, state, weight = posed(variant)
@@ -63,7 +69,10 @@ def test_the_rows_of_every_view_are_the_derivatives_of_its_projections(variant):
         by_point = cameras + data.joint[of, None, None] + joints * np.arange(3)
         assert_rows(a, expected[..., 6 * n : 6 * n + 6])
         assert_rows(rows, np.take_along_axis(expected, by_point, axis=2))
-        assert_rows(lens[: len(problem.refine)], expected[..., cameras + points :])
+        own = 0 if problem.lens is None else problem.lens[n]
+        lenses = expected[..., cameras + points :].reshape(*expected.shape[:2], problem.lenses, -1)
+        assert_rows(lens[: len(problem.refine)], lenses[..., own, :])
+        assert not np.delete(lenses, own, axis=2).any(), "other lenses change nothing"
         assert_rows(off[None], residual[of, :, None])
 
 
@@ -72,7 +81,7 @@ def assert_rows(ours: np.ndarray, expected: np.ndarray) -> None:
     np.testing.assert_allclose(ours, expected.T.reshape(ours.shape), rtol=1e-10, atol=1e-9)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", [*VARIANTS, *SEVERAL_LENSES])
 def test_errors_are_projections_less_detections(variant):
     problem, state, _ = posed(variant)
     found, seen = evaluated(problem, state), problem.weight > 0
@@ -83,7 +92,7 @@ def test_errors_are_projections_less_detections(variant):
 
 
 @pytest.mark.parametrize("damping", [1e-3, 10.0])
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", [*VARIANTS, *SEVERAL_LENSES])
 def test_a_step_is_that_of_the_whole_system(variant, damping):
     problem, state, weight = posed(variant)
     ours = Step(problem, state, weight, damping)
@@ -91,7 +100,7 @@ def test_a_step_is_that_of_the_whole_system(variant, damping):
     assert_alike(ours.state, book.step(problem, state, weight, damping, BELIEF, VARIANCE))
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", [*VARIANTS, *SEVERAL_LENSES])
 def test_the_reduced_system_is_the_schur_complement_of_the_cameras(variant):
     problem, state, weight = posed(variant)
     ours = Step(problem, state, weight, 1e-3)
@@ -105,7 +114,7 @@ def test_the_reduced_system_is_the_schur_complement_of_the_cameras(variant):
     np.testing.assert_allclose(ours.rhs, expected, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
 
 
-@pytest.mark.parametrize("variant", ["plain", "shape", "orbit", "everything"])
+@pytest.mark.parametrize("variant", ["plain", "shape", "orbit", "everything", "two lenses, everything"])
 @pytest.mark.parametrize("phase", [robust.CAUCHY, robust.HUBER, robust.SQUARES, robust.TRIMMED])
 def test_the_gradient_of_the_cost_vanishes_where_steps_do(variant, phase):
     """What is reduced is the cost that is compared: after many steps any other direction costs more."""
@@ -121,7 +130,7 @@ def test_the_gradient_of_the_cost_vanishes_where_steps_do(variant, phase):
         damping = max(damping / 10, 1e-9) if better else min(10 * damping, 1e9)
         if better:
             now, trial, cost = trial, now, proposed
-    here = State(now.rotation, now.translation, now.points, *now.intrinsics.tolist())
+    here = state_of(now)
     for k in range(20):
         change = 1e-4 * randn(sum(book.unknowns(problem)), seed=k)
         there = book.moved_by(problem, here, change)
@@ -138,7 +147,7 @@ def test_a_damped_step_lowers_the_cost():
     assert squares(Step(problem, state, weight, 1e-3).state) < 0.5 * squares(state)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", [*VARIANTS, *SEVERAL_LENSES])
 def test_cameras_stay_rigid(variant):
     problem, state, weight = posed(variant)
     rotation = Step(problem, state, weight, 1e-3).state.rotation
