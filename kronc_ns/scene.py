@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from kronc_ns.errors import KroncError
-from kronc_ns.geometry.camera import Camera
+from kronc_ns.geometry.camera import Camera, Lenses, rays
 from kronc_ns.keypoints.schema import KeypointSchema
 
 _SIGMA_LIMITS = (0.5, 3.0)  # of the usual one
@@ -15,11 +15,12 @@ _SIGMA_LIMITS = (0.5, 3.0)  # of the usual one
 
 @dataclass(frozen=True)
 class Scene:
-    """N views of one object by one camera, with J keypoints; immutable, made by `load_scene` or by hand."""
+    """N views of one object with J keypoints; immutable, made by `load_scene` or by hand."""
 
     names: tuple[str, ...]
     """``file_path`` of each view, relative to the folder, in capture order."""
     camera: Camera
+    """Of all views; where there are several, that whose pixels `uv` and all errors are in."""
     schema: KeypointSchema
     keypoints: Float[np.ndarray, "n j 3"]
     """(u, v, confidence) in pixels as detected (distorted); confidence 0: not seen."""
@@ -33,6 +34,9 @@ class Scene:
     """What loading decided that the user may want to know."""
     sigma_px: Float[np.ndarray, "n j"] | None = None
     """Standard deviation of each place along one axis, where the detector knew it; 0 where nothing was found."""
+
+    lenses: Lenses | None = None
+    """The cameras of the views, where there are several."""
 
     def __post_init__(self) -> None:
         if self.keypoints.shape != (len(self.names), len(self.schema), 3):
@@ -59,13 +63,24 @@ class Scene:
         """The paper's m: 1 where a keypoint was found, else 0."""
         return self.seen.astype(np.float64)
 
+    def camera_of(self, view: int) -> Camera:
+        """The camera that took a view."""
+        return self.camera if self.lenses is None else self.lenses.cameras[self.lenses.of_view[view]]
+
+    @cached_property
+    def enlargement(self) -> Float[np.ndarray, "n"]:
+        """How many pixels of each view's own camera make one of `camera`."""
+        if self.lenses is None:
+            return np.ones(len(self))
+        return np.array([camera.fx for camera in self.lenses.cameras])[self.lenses.of_view] / self.camera.fx
+
     @cached_property
     def precision(self) -> Float[np.ndarray, "n j"]:
         """How much each measurement counts beside the others: confidence over variance; 0 where nothing was found.
 
         What a detector says of its noise is believed within limits: no point counts for dozens of others.
         """
-        confidence = self.keypoints[..., 2]
+        confidence = self.keypoints[..., 2] * np.square(self.enlargement)[:, None]
         if self.sigma_px is None or not self.seen.any():
             return confidence
         usual = max(float(np.median(self.sigma_px[self.seen])), 1e-9)
@@ -83,5 +98,12 @@ class Scene:
 
     @cached_property
     def uv(self) -> Float[np.ndarray, "n j 2"]:
-        """Pixels with lens distortion removed."""
-        return self.camera.undistort(self.keypoints[..., :2])
+        """Pixels with lens distortion removed, as `camera` would have seen them."""
+        if self.lenses is None:
+            return self.camera.undistort(self.keypoints[..., :2])
+        uv = np.empty(self.keypoints[..., :2].shape)
+        for lens, camera in enumerate(self.lenses.cameras):
+            own = self.lenses.of_view == lens
+            plane = rays(camera.undistort(self.keypoints[own, :, :2]), camera)[..., :2]
+            uv[own] = plane * (self.camera.fx, self.camera.fy) + (self.camera.cx, self.camera.cy)
+        return uv

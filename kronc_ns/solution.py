@@ -7,7 +7,7 @@ from enum import Enum
 import numpy as np
 from jaxtyping import Bool, Float
 
-from kronc_ns.geometry.camera import Camera
+from kronc_ns.geometry.camera import Camera, Lenses
 
 
 class Status(str, Enum):
@@ -57,6 +57,7 @@ class Solution:
     """One sentence on the status, with the remedy where it is not `Status.CONVERGED`."""
     names: tuple[str, ...]
     camera: Camera
+    """Of all views; where there are several, that whose pixels all errors are in."""
     c2w: Float[np.ndarray, "n 3 4"]
     """Poses; NaN where a view failed."""
     points: Float[np.ndarray, "j 3"]
@@ -77,6 +78,12 @@ class Solution:
     history: Mapping[str, Sequence[float]] = field(default_factory=dict)
     path: Float[np.ndarray, "s n 3 4"] | None = None
     """Where the cameras were at steps on the way, each in a frame of its own; NaN for views that took no part."""
+    lenses: Lenses | None = None
+    """The cameras of the views, where there are several."""
+
+    def camera_of(self, view: int) -> Camera:
+        """The camera that took a view."""
+        return self.camera if self.lenses is None else self.lenses.cameras[self.lenses.of_view[view]]
 
     def views_that_are(self, status: ViewStatus) -> Bool[np.ndarray, "n"]:
         """Which views came about so."""

@@ -111,4 +111,5 @@ def chosen_views(scene: Scene, keep: Bool[np.ndarray, "n"]) -> Scene:
         given_c2w=None if scene.given_c2w is None else scene.given_c2w[keep],
         given_depths=None if scene.given_depths is None else scene.given_depths[keep],
         masks=None if scene.masks is None else names(scene.masks),
+        lenses=None if scene.lenses is None else scene.lenses.chosen(keep),
     )

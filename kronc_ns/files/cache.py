@@ -16,7 +16,7 @@ from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import Progress, solve_scene
 from kronc_ns.scene import Scene
 
-_FORMAT = 7  # raised whenever the same input and options give another solution
+_FORMAT = 8  # raised whenever the same input and options give another solution
 
 
 def cache_folder() -> Path:
@@ -31,7 +31,8 @@ def fingerprint(scene: Scene, config: KroncConfig) -> str:
     given = scene.given_c2w if config.init in ("auto", "given") else None
     depths = scene.given_depths if config.depth_init != "random" else None
     names = [PurePosixPath(name).name for name in scene.names]
-    header = json.dumps([_FORMAT, names, asdict(scene.camera), describe_schema(scene.schema), settings], sort_keys=True)
+    cameras = [asdict(scene.camera), *(map(asdict, scene.lenses.each) if scene.lenses else ())]
+    header = json.dumps([_FORMAT, names, cameras, describe_schema(scene.schema), settings], sort_keys=True)
     digest = hashlib.sha256(header.encode())
     for array in (scene.keypoints, scene.sigma_px, given, depths):
         digest.update(b"-" if array is None else np.ascontiguousarray(array, dtype=np.float64).tobytes())

@@ -5,12 +5,12 @@ from pathlib import Path
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import read_json
 from kronc_ns.files.record import KEYPOINT_COLOUR, solved_points
-from kronc_ns.files.transforms import camera_and_frames, check_file_names, read_poses
+from kronc_ns.files.transforms import cameras_and_frames, check_file_names, read_poses
 from kronc_ns.geometry.poses import invert
 
 
 def write_colmap(folder: Path, solved: Path) -> int:
-    """Write the COLMAP model (binary) of a solved folder: camera, images with poses, keypoints as 3D points.
+    """Write the COLMAP model (binary) of a solved folder: cameras, images with poses, keypoints as 3D points.
 
     Returns the number of images. Positions, axes and the half-pixel convention are COLMAP's.
     """
@@ -19,22 +19,24 @@ def write_colmap(folder: Path, solved: Path) -> int:
     import pycolmap
 
     transforms = solved / "transforms.json"
-    camera, frames = camera_and_frames(read_json(transforms), transforms)
+    cameras, frames = cameras_and_frames(read_json(transforms), transforms)
     check_file_names([frame["file_path"] for frame in frames], transforms)
     poses = read_poses(transforms)
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            camera_id=1,
-            model="OPENCV",
-            width=camera.width,
-            height=camera.height,
-            params=[camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
+    numbers = {camera: number for number, camera in enumerate(dict.fromkeys(cameras), start=1)}
+    for camera, number in numbers.items():
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=number,
+                model="OPENCV",
+                width=camera.width,
+                height=camera.height,
+                params=[camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
+            )
         )
-    )
-    for number, frame in enumerate(frames, start=1):
+    for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True), start=1):
         w2c = invert(poses[frame["file_path"]])
-        image = pycolmap.Image(name=Path(frame["file_path"]).name, camera_id=1, image_id=number)
+        image = pycolmap.Image(name=Path(frame["file_path"]).name, camera_id=numbers[camera], image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(w2c))
     for point in solved_points(solved):
         model.add_point3D(point, pycolmap.Track(), KEYPOINT_COLOUR)

@@ -15,7 +15,8 @@ from kronc_ns.files.keypoints import match_keypoints, read_keypoints, sigma_of, 
 from kronc_ns.files.output import read_json, relative_path, release_output, write_json
 from kronc_ns.files.ply import write_points
 from kronc_ns.files.provenance import provenance
-from kronc_ns.files.transforms import camera_and_frames, read_poses, transforms_dict
+from kronc_ns.files.transforms import INTRINSICS, cameras_and_frames, intrinsics_dict, read_poses, transforms_dict
+from kronc_ns.geometry.camera import Lenses
 from kronc_ns.geometry.poses import camera_z
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
@@ -31,7 +32,7 @@ def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, i
     """
     names = [relative_path(data, name, folder) for name in solution.names]
     masks = [relative_path(data, mask, folder) for mask in scene.masks] if scene.masks else None
-    content = transforms_dict(solution.camera, names, solution.c2w, masks)
+    content = transforms_dict(solution.camera, names, solution.c2w, masks, lenses=solution.lenses)
     known = solution.points[np.isfinite(solution.points).all(-1)]
     (folder / "keypoints.ply").unlink(missing_ok=True)
     if len(known):
@@ -40,7 +41,7 @@ def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, i
     write_json(folder / "transforms.json", content)
     if folder.resolve() != data.resolve():  # where they stand already
         rows = dict(zip(names, scene.keypoints, strict=True))
-        size = (scene.camera.width, scene.camera.height)
+        size = None if scene.lenses else (scene.camera.width, scene.camera.height)
         write_keypoints(folder / "keypoints.json", scene.schema, size, rows, scene.sigma_px)
     report = {
         **solution_dict(solution),
@@ -68,8 +69,12 @@ def solution_dict(solution: Solution) -> dict[str, Any]:
         "median_px": _number(solution.median_px),
         "focal_px": [solution.camera.fx, solution.camera.fy],
         "views": [
-            {**{"file_path" if k == "name" else k: v for k, v in asdict(view).items()}, "status": view.status.value}
-            for view in solution.views
+            {
+                **{"file_path" if k == "name" else k: v for k, v in asdict(view).items()},
+                "status": view.status.value,
+                **({} if solution.lenses is None else intrinsics_dict(solution.camera_of(i))),
+            }
+            for i, view in enumerate(solution.views)
         ],
         "points": [[_number(x) for x in point] for point in solution.points.tolist()],
         "history": {key: [_number(x) for x in values] for key, values in solution.history.items()},
@@ -114,7 +119,9 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
 
     transforms = folder / "transforms.json"
     # of failed views transforms.json says nothing
-    camera, _ = camera_and_frames({**read_json(transforms), "frames": record["views"]}, transforms)
+    cameras, _ = cameras_and_frames({**read_json(transforms), "frames": record["views"]}, transforms)
+    lenses = Lenses.of(cameras)
+    camera = cameras[0] if lenses is None else lenses.usual
     poses = read_poses(transforms)
     names = _as_listed(names, poses)
     c2w = np.stack([poses.get(name, np.full((3, 4), np.nan)) for name in names])
@@ -122,7 +129,7 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
     if len(points) != len(found.schema):
         raise KroncError(f"{file} has {len(points)} points, keypoints.json {len(found.schema)}: solve again")
     rows = match_keypoints(found, names, camera)[0]
-    detected = Scene(names, camera, found.schema, rows, sigma_px=sigma_of(found, names, rows))
+    detected = Scene(names, camera, found.schema, rows, sigma_px=sigma_of(found, names, rows), lenses=lenses)
     scene = detected.with_sides_swapped(np.array([view.swapped for view in views]))
     solved = np.array([view.status is ViewStatus.SOLVED for view in views])
     depths = camera_z(c2w, points)
@@ -137,6 +144,7 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         initial_c2w=initial,
         history=history,
         path=path,
+        lenses=lenses,
         **overall,
     )
     return scene, solution
@@ -175,7 +183,7 @@ def _as_listed(names: Sequence[str], listed: Iterable[str]) -> tuple[str, ...]:
 
 
 def _view(view: dict[str, Any]) -> ViewReport:
-    evidence = {key: value for key, value in view.items() if key != "file_path"}
+    evidence = {key: value for key, value in view.items() if key not in ("file_path", *INTRINSICS)}
     return ViewReport(**{**evidence, "name": view["file_path"], "status": ViewStatus(view["status"])})
 
 

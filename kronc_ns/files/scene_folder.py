@@ -12,8 +12,8 @@ from kronc_ns.files.images import depth_under, read_depth
 from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints, sigma_of
 from kronc_ns.files.output import read_json
 from kronc_ns.files.record import left_out_views
-from kronc_ns.files.transforms import camera_and_frames, given_poses
-from kronc_ns.geometry.camera import Camera
+from kronc_ns.files.transforms import cameras_and_frames, given_poses
+from kronc_ns.geometry.camera import Camera, Lenses
 from kronc_ns.scene import Scene
 
 _UNDONE_PX, _FEW = 0.5, 0.05
@@ -34,7 +34,9 @@ def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
             "`ns-process-data kronc` makes one from photos or a video"
         )
     content = read_json(file)
-    camera, frames = camera_and_frames(content, file)
+    cameras, frames = cameras_and_frames(content, file)
+    lenses = Lenses.of(cameras)
+    camera = cameras[0] if lenses is None else lenses.usual
     names = tuple(str(frame["file_path"]) for frame in frames)
     _check_images(folder, names)
     masks = tuple(str(frame.get("mask_path", "")) for frame in frames)
@@ -44,16 +46,23 @@ def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
     found = read_keypoints(keypoints or folder)
     if is_solution:
         found = _without(found, left_out_views(folder))
+    if lenses is not None and found.size is not None and any((c.width, c.height) != found.size for c in cameras):
+        raise KroncError(
+            f"{found.source} is for images of {found.size[0]}x{found.size[1]}, {file} has images of several sizes: "
+            "expected keypoints in the pixels of each image, and no width and height for all"
+        )
     rows, note = match_keypoints(found, names, camera, [folder / m for m in masks] if all(masks) and masks else None)
-    _check_distortion(camera, rows, file)
+    for own in set(cameras):
+        _check_distortion(own, rows[[one == own for one in cameras]], file)
     return Scene(
         names=names,
         camera=camera,
+        lenses=lenses,
         schema=found.schema,
         keypoints=rows,
         sigma_px=sigma_of(found, names, rows),
         given_c2w=None if is_solution else given_poses(frames, file),
-        given_depths=_given_depths(folder, frames, rows, camera),
+        given_depths=_given_depths(folder, frames, rows, cameras),
         masks=masks if any(masks) else None,
         notes=(note,) if note else (),
     )
@@ -89,13 +98,13 @@ def _check_images(folder: Path, names: tuple[str, ...]) -> None:
 
 
 def _given_depths(
-    folder: Path, frames: list[dict[str, Any]], rows: Float[np.ndarray, "n j 3"], camera: Camera
+    folder: Path, frames: list[dict[str, Any]], rows: Float[np.ndarray, "n j 3"], cameras: list[Camera]
 ) -> Float[np.ndarray, "n j"] | None:
     """Depth maps (nerfstudio's 16-bit millimetres, or .npy in metres) read under the keypoints."""
     if not all(frame.get("depth_file_path") for frame in frames):
         return None
     depths = [
         depth_under(row, read_depth(folder / str(frame["depth_file_path"])), camera)
-        for frame, row in zip(frames, rows, strict=True)
+        for frame, row, camera in zip(frames, rows, cameras, strict=True)
     ]
     return np.stack(depths)

@@ -1,4 +1,4 @@
-"""nerfstudio's transforms.json: the shared camera and the frames, read and written (OpenGL axes in the file)."""
+"""nerfstudio's transforms.json: the cameras and the frames, read and written (OpenGL axes in the file)."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -10,10 +10,11 @@ from jaxtyping import Float
 
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import read_json
-from kronc_ns.geometry.camera import Camera
+from kronc_ns.geometry.camera import Camera, Lenses
 from kronc_ns.geometry.poses import flip_camera_axes
 
-_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
+INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
+"""nerfstudio's names of a camera's numbers."""
 
 
 def transforms_dict(
@@ -22,25 +23,21 @@ def transforms_dict(
     c2w: Float[np.ndarray, "n 3 4"] | None,
     masks: Sequence[str] | None = None,
     depths: Sequence[str] | None = None,
+    lenses: Lenses | None = None,
 ) -> dict[str, Any]:
-    """nerfstudio's transforms.json (OpenGL axes) as a dictionary; views with NaN poses are left out."""
-    content: dict[str, Any] = {
-        "camera_model": "OPENCV",
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "w": camera.width,
-        "h": camera.height,
-        "k1": camera.k1,
-        "k2": camera.k2,
-        "p1": camera.p1,
-        "p2": camera.p2,
-    }
+    """nerfstudio's transforms.json (OpenGL axes) as a dictionary; views with NaN poses are left out.
+
+    With ``lenses`` every frame has its own intrinsics, for what stands at the top level holds for all.
+    """
+    content: dict[str, Any] = {"camera_model": "OPENCV"}
+    if lenses is None:
+        content |= intrinsics_dict(camera)
     frames = []
     opengl = None if c2w is None else flip_camera_axes(c2w)
     for i, name in enumerate(names):
         frame: dict[str, Any] = {"file_path": name}
+        if lenses is not None:
+            frame |= intrinsics_dict(lenses.cameras[lenses.of_view[i]])
         if masks is not None:
             frame["mask_path"] = masks[i]
         if depths is not None:
@@ -54,8 +51,24 @@ def transforms_dict(
     return content
 
 
+def intrinsics_dict(camera: Camera) -> dict[str, float]:
+    """A camera under nerfstudio's names."""
+    values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, *camera.distortion)
+    return dict(zip(INTRINSICS, values, strict=True))
+
+
 def camera_and_frames(content: Any, file: Path) -> tuple[Camera, list[dict[str, Any]]]:
-    """The shared camera and the frames of a nerfstudio transforms file."""
+    """The shared camera and the frames of a nerfstudio transforms file; `KroncError` where there are several."""
+    cameras, frames = cameras_and_frames(content, file)
+    if len(set(cameras)) > 1:
+        sizes = sorted({(c.width, c.height) for c in cameras})
+        what = f"images of different sizes {sizes}" if len(sizes) > 1 else "frames with different intrinsics"
+        raise KroncError(f"{file}: {what}: expected one camera and one size for all views")
+    return cameras[0], frames
+
+
+def cameras_and_frames(content: Any, file: Path) -> tuple[list[Camera], list[dict[str, Any]]]:
+    """The camera of every frame, and the frames, of a nerfstudio transforms file."""
     frames = _frames(content, file)
     if not frames:
         raise KroncError(f"{file}: no frames: expected at least 3 views")
@@ -66,25 +79,23 @@ def camera_and_frames(content: Any, file: Path) -> tuple[Camera, list[dict[str, 
         raise KroncError(
             f"{file}: camera_model {content['camera_model']!r} is not supported: expected OPENCV or PINHOLE"
         )
-    cameras = set()
+    cameras = []
     for frame in frames:
-        merged = {key: frame.get(key, content.get(key)) for key in _INTRINSICS}
+        merged = {key: frame.get(key, content.get(key)) for key in INTRINSICS}
         merged["fl_y"] = merged["fl_x"] if merged["fl_y"] is None else merged["fl_y"]
-        missing = [key for key in _INTRINSICS[:6] if merged[key] is None]
+        missing = [key for key in INTRINSICS[:6] if merged[key] is None]
         if missing:
-            raise KroncError(f"{file}: {', '.join(missing)} missing: expected the intrinsics at the top level")
+            raise KroncError(
+                f"{file}: {', '.join(missing)} missing: expected the intrinsics at the top level, or in every frame"
+            )
         try:
-            numbers = [float(0.0 if merged[key] is None else merged[key]) for key in _INTRINSICS]
+            numbers = [float(0.0 if merged[key] is None else merged[key]) for key in INTRINSICS]
             width, height = map(int, numbers[4:6])
         except (TypeError, ValueError, OverflowError):
             raise KroncError(f"{file}: intrinsics {merged} are not all finite numbers") from None
         fx, fy, cx, cy = numbers[:4]
-        cameras.add(Camera(fx, fy, cx, cy, width, height, *numbers[6:]))
-    if len(cameras) > 1:
-        sizes = sorted({(c.width, c.height) for c in cameras})
-        what = f"images of different sizes {sizes}" if len(sizes) > 1 else "frames with different intrinsics"
-        raise KroncError(f"{file}: {what}: expected one camera and one size for all views")
-    return cameras.pop(), frames
+        cameras.append(Camera(fx, fy, cx, cy, width, height, *numbers[6:]))
+    return cameras, frames
 
 
 def read_poses(file: Path) -> dict[str, Float[np.ndarray, "3 4"]]:

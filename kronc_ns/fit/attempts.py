@@ -11,9 +11,11 @@ from jaxtyping import Bool, Float, Int
 from kronc_ns.fit.noise import Noise, believed_noise
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.starts import MIN_POINTS, Hypothesis, usable_views
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import invert, make_pose
 from kronc_ns.keypoints.schema import KeypointSchema
 from kronc_ns.keypoints.template import car_template
+from kronc_ns.scene import Scene
 from kronc_ns.solve.covariance import camera_covariance
 from kronc_ns.solve.lm import LmResult, adjust
 from kronc_ns.solve.problem import Intrinsic, Problem, ShapePrior, State
@@ -86,7 +88,7 @@ def adjust_starts(
         *(("focal",) if config.refine_focal else ()),
         *(("k1",) if config.refine_k1 else ()),
     )
-    if config.device == "cuda":
+    if config.device == "cuda" and all(one.scene.lenses is None for one in starts):
         from kronc_ns.solve.batched import adjust_batch  # seconds of torch's import
 
         def solve(found: Sequence[Hypothesis]) -> list[tuple[Problem, LmResult]]:
@@ -149,17 +151,31 @@ def problem_of(found: Hypothesis, refine: tuple[Intrinsic, ...] = (), with_prior
         m = m * (m.sum(0) >= 2)  # without a prior a single view says nothing of a point
     precise = m * scene.precision
     weight = precise / max(precise.sum(), 1e-9) * m.sum()
-    return Problem(scene.uv - (camera.cx, camera.cy), weight, (camera.fx, camera.fy), prior, refine=refine)
+    lens = None if scene.lenses is None else scene.lenses.of_view
+    return Problem(scene.uv - (camera.cx, camera.cy), weight, (camera.fx, camera.fy), prior, refine=refine, lens=lens)
 
 
 def _moved(start: Hypothesis, result: LmResult) -> Hypothesis:
     """The start where the solver has left it, its camera included."""
-    state, scene, old = result.state, start.scene, start.scene.camera
-    if state.log_growth or state.k1:
-        growth = math.exp(state.log_growth)
-        scene = replace(scene, camera=replace(old, fx=old.fx * growth, fy=old.fy * growth, k1=old.k1 + state.k1))
+    state, scene = result.state, start.scene
+    if np.any(state.log_growth) or np.any(state.k1):
+        scene = _refined(scene, np.atleast_1d(state.log_growth), np.atleast_1d(state.k1))
     c2w = np.where(start.used[:, None, None], state.c2w, start.c2w)
     return replace(start, scene=scene, c2w=c2w, points=state.points)
+
+
+def _refined(scene: Scene, log_growth: Float[np.ndarray, "g"], k1: Float[np.ndarray, "g"]) -> Scene:
+    """The scene with what was found of the intrinsics of its cameras."""
+
+    def changed(camera: Camera, lens: int) -> Camera:
+        growth = math.exp(log_growth[lens])
+        return replace(camera, fx=camera.fx * growth, fy=camera.fy * growth, k1=camera.k1 + float(k1[lens]))
+
+    if scene.lenses is None:
+        return replace(scene, camera=changed(scene.camera, 0))
+    cameras = tuple(changed(camera, lens) for lens, camera in enumerate(scene.lenses.cameras))
+    usual = cameras[scene.lenses.cameras.index(scene.camera)]
+    return replace(scene, camera=usual, lenses=replace(scene.lenses, cameras=cameras))
 
 
 def measured(

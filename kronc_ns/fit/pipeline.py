@@ -286,6 +286,7 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig, seconds: float)
         median_px=verdict.median_px,
         history=attempt.history,
         path=attempt.path,
+        lenses=found.scene.lenses,
     )
 
 

@@ -115,7 +115,7 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     distance = _distance(evidence)
     sure = (evidence.sigma_rot_deg <= _SURE_DEG) & (evidence.sigma_trans_m <= _SURE_SHARE * distance)
     alone = evidence.lead >= _LEAST_LEAD
-    columns = (x.tolist() for x in (found, counted, good, agree, alone, sure, rmse))
+    columns = (x.tolist() for x in (found, counted, good, agree, alone, sure, rmse * scene.enlargement))
     facts = (_Facts(*row) for row in zip(*columns, strict=True))
     views = tuple(_report(name, of, evidence, i) for i, (name, of) in enumerate(zip(scene.names, facts, strict=True)))
     solved = np.array([view.status is ViewStatus.SOLVED for view in views], dtype=bool)

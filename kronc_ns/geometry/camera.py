@@ -1,12 +1,13 @@
-"""The pinhole camera: intrinsics, projection and back-projection.
+"""Pinhole cameras: intrinsics, projection and back-projection.
 
 Pixels: the centre of the top-left pixel is (0.5, 0.5), as in nerfstudio and COLMAP.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.poses import invert
@@ -14,7 +15,7 @@ from kronc_ns.geometry.poses import invert
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics shared by all views of a scene, in pixels (OpenCV distortion model)."""
+    """Intrinsics in pixels (OpenCV distortion model)."""
 
     fx: float
     fy: float
@@ -88,6 +89,38 @@ class Camera:
             width=round(self.width * factor),
             height=round(self.height * factor),
         )
+
+
+@dataclass(frozen=True)
+class Lenses:
+    """The cameras of N views where these are not all alike."""
+
+    cameras: tuple[Camera, ...]
+    """Each once."""
+    of_view: Int[np.ndarray, "n"]
+    """Which of them took each view."""
+
+    @staticmethod
+    def of(cameras: Sequence[Camera]) -> "Lenses | None":
+        """From the camera of each view; None where all are the same."""
+        distinct = tuple(dict.fromkeys(cameras))
+        if len(distinct) < 2:
+            return None
+        return Lenses(distinct, np.array([distinct.index(camera) for camera in cameras]))
+
+    @property
+    def usual(self) -> Camera:
+        """The one of most views."""
+        return self.cameras[int(np.bincount(self.of_view).argmax())]
+
+    @property
+    def each(self) -> tuple[Camera, ...]:
+        """The camera of each view."""
+        return tuple(self.cameras[lens] for lens in self.of_view)
+
+    def chosen(self, keep: Bool[np.ndarray, "n"]) -> "Lenses":
+        """Of some of the views."""
+        return Lenses(self.cameras, self.of_view[keep])
 
 
 def rays(uv: Float[np.ndarray, "*b 2"], camera: Camera) -> Float[np.ndarray, "*b 3"]:

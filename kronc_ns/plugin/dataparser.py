@@ -5,6 +5,7 @@ nerfstudio loads dataparsers while those are still being imported.
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -104,20 +105,23 @@ class KroncDataParser(DataParser):
         return scene, read_solution(folder)[1]
 
     def _outputs(self, split: str, scene: Scene, solution: Solution) -> DataparserOutputs:
-        config, camera = self.config, solution.camera  # whose intrinsics may have been refined
+        config = self.config
         test = test_views(len(solution.names), config.eval_interval, config.eval_fraction)
         everyone = solved_views(config.data, scene, solution, test)
-        level = image_level(everyone.images[0], (camera.width, camera.height), config.downscale_factor)
+        # of the solution, whose intrinsics may have been refined
+        sizes = [(camera.width, camera.height) for camera in everyone.cameras]
+        largest = max(range(len(sizes)), key=lambda i: max(sizes[i]))
+        level = image_level(everyone.images[largest], sizes[largest], config.downscale_factor)
         views = everyone.of_split(split).at_level(level)
         images, masks = self._images(views)
         points = solution.points[np.isfinite(solution.points).all(-1)]
         world = world_around(points, everyone.c2w[everyone.posed], config.scene_scale, config.scale_factor)
         seeds = grey(points)
         if split == "train":  # models start from the training views' metadata
-            seeds += self._seeds(views, camera, world.box)
+            seeds += self._seeds(views, world.box)
         return DataparserOutputs(
             image_filenames=images,
-            cameras=_cameras(world.of_poses(views.c2w), camera, level),
+            cameras=_cameras(world.of_poses(views.c2w), views.cameras, level),
             alpha_color=None if config.background == "keep" else torch.ones(3),
             scene_box=SceneBox(aabb=_tensor(world.of_points(world.box))),
             mask_filenames=masks,
@@ -138,12 +142,12 @@ class KroncDataParser(DataParser):
             return list(views.images), list(views.masks)
         return cut_out(views.images, views.masks), None
 
-    def _seeds(self, views: SolvedViews, camera: Camera, box: Float[np.ndarray, "2 3"]) -> Seeds:
+    def _seeds(self, views: SolvedViews, box: Float[np.ndarray, "2 3"]) -> Seeds:
         """Points to start from, in the solved world: the visual hull, or else random points."""
         count = self.config.num_seed_points
         car = box_seeds(box, count)
         if views.masks is not None and self.config.seeds == "hull":
-            hull = carve(read_pictures(views.images, views.masks, camera), views.c2w, box, count)
+            hull = carve(read_pictures(views.images, views.masks, views.cameras), views.c2w, box, count)
             if len(hull.points):
                 car = hull
             else:
@@ -155,18 +159,20 @@ class KroncDataParser(DataParser):
         return car + ground_seeds(box, views.c2w, count // 2)
 
 
-def _cameras(c2w: Float[np.ndarray, "n 3 4"], camera: Camera, level: int) -> Cameras:
+def _cameras(c2w: Float[np.ndarray, "n 3 4"], of_views: Sequence[Camera], level: int) -> Cameras:
     """nerfstudio's cameras at ``c2w`` (OpenCV axes) for images at 1/``level`` of their size."""
-    distortion = torch.tensor([camera.k1, camera.k2, 0.0, 0.0, camera.p1, camera.p2])
+    numbers = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in of_views])[..., None]
+    sizes = torch.tensor([[c.width, c.height] for c in of_views])[..., None]
+    fx, fy, cx, cy = numbers.unbind(1)
     cameras = Cameras(
         camera_to_worlds=_tensor(flip_camera_axes(c2w)),
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        width=camera.width,
-        height=camera.height,
-        distortion_params=distortion.expand(len(c2w), -1),
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        width=sizes[:, 0],
+        height=sizes[:, 1],
+        distortion_params=torch.tensor([[c.k1, c.k2, 0.0, 0.0, c.p1, c.p2] for c in of_views]),
         camera_type=CameraType.PERSPECTIVE,
     )
     cameras.rescale_output_resolution(scaling_factor=1.0 / level)

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from kronc_ns.capture.images import level_path
 from kronc_ns.errors import KroncError
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import posed
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution
@@ -21,6 +22,7 @@ class SolvedViews:
 
     images: tuple[Path, ...]
     masks: tuple[Path, ...] | None
+    cameras: tuple[Camera, ...]
     c2w: Float[np.ndarray, "n 3 4"]
     """Poses in the solved world (OpenCV axes); NaN where there is none."""
     test: Bool[np.ndarray, "n"]
@@ -41,7 +43,8 @@ class SolvedViews:
             total = len(self.images)
             raise KroncError(f"no view is left for the {split} split: {self.posed.sum()} of {total} views have a pose")
         masks = None if self.masks is None else tuple(self.masks[i] for i in chosen)
-        return SolvedViews(tuple(self.images[i] for i in chosen), masks, self.c2w[chosen], self.test[chosen])
+        images, cameras = (tuple(of[i] for i in chosen) for of in (self.images, self.cameras))
+        return SolvedViews(images, masks, cameras, self.c2w[chosen], self.test[chosen])
 
     def at_level(self, factor: int) -> "SolvedViews":
         """With the images and masks at 1/``factor`` of their size; raises `KroncError` where one does not exist."""
@@ -68,7 +71,9 @@ def solved_views(data: Path, scene: Scene, solution: Solution, test: Bool[np.nda
         raise KroncError(f"{data / unknown[0]} is not among the views of {data / 'kronc.json'}: solve again")
     rows = np.array([place[PurePosixPath(name).name] for name in scene.names])
     masks = None if scene.masks is None else tuple(data / mask for mask in scene.masks)
-    return SolvedViews(tuple(data / name for name in scene.names), masks, solution.c2w[rows], test[rows])
+    images = tuple(data / name for name in scene.names)
+    cameras = tuple(solution.camera_of(row) for row in rows.tolist())
+    return SolvedViews(images, masks, cameras, solution.c2w[rows], test[rows])
 
 
 def test_views(views: int, interval: int, fraction: float | None) -> Bool[np.ndarray, "n"]:

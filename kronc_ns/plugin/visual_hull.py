@@ -22,26 +22,29 @@ _FEWEST_VIEWS = 3  # a voxel that fewer views see is not known to be the car
 
 @dataclass(frozen=True)
 class Pictures:
-    """Small copies of images and masks with their camera."""
+    """Small copies of N images and masks with their cameras."""
 
-    rgb: UInt8[np.ndarray, "n h w 3"]
-    mask: Bool[np.ndarray, "n h w"]
-    camera: Camera
+    rgb: tuple[UInt8[np.ndarray, "_ _ 3"], ...]
+    mask: tuple[Bool[np.ndarray, "_ _"], ...]
+    cameras: tuple[Camera, ...]
 
 
-def read_pictures(images: Sequence[Path], masks: Sequence[Path], camera: Camera) -> Pictures:
+def read_pictures(images: Sequence[Path], masks: Sequence[Path], cameras: Sequence[Camera]) -> Pictures:
     """Read images and masks, reduced so that the longer side is at most 400 px, lens distortion taken out."""
     import cv2
 
-    small = camera.scaled(min(1.0, _LONGER_SIDE_PX / max(camera.width, camera.height)))
+    cameras = tuple(c.scaled(min(1.0, _LONGER_SIDE_PX / max(c.width, c.height))) for c in cameras)
 
-    def straight(picture: UInt8[np.ndarray, "h w *c"], how: int) -> UInt8[np.ndarray, "h2 w2 *c"]:
+    def straight(picture: UInt8[np.ndarray, "h w *c"], small: Camera, how: int) -> UInt8[np.ndarray, "h2 w2 *c"]:
         reduced = cv2.resize(picture, (small.width, small.height), interpolation=how)
         return cv2.undistort(reduced, small.matrix, np.array(small.distortion)) if any(small.distortion) else reduced
 
-    rgb = [straight(np.asarray(load_image(path).convert("RGB")), cv2.INTER_AREA) for path in images]
-    mask = [straight(read_grey(path), cv2.INTER_NEAREST) > 0 for path in masks]
-    return Pictures(np.stack(rgb), np.stack(mask), small)
+    rgb = (
+        straight(np.asarray(load_image(path).convert("RGB")), small, cv2.INTER_AREA)
+        for path, small in zip(images, cameras, strict=True)
+    )
+    mask = (straight(read_grey(path), small, cv2.INTER_NEAREST) > 0 for path, small in zip(masks, cameras, strict=True))
+    return Pictures(tuple(rgb), tuple(mask), cameras)
 
 
 def carve(pictures: Pictures, c2w: Float[np.ndarray, "n 3 4"], box: Float[np.ndarray, "2 3"], count: int) -> Seeds:
@@ -85,8 +88,8 @@ def _occupied(
     most = max(1, round(_DISSENT * len(c2w)))
     against, watched = np.zeros((2, len(points)), dtype=np.int16)
     alive = np.arange(len(points))
-    for pose, mask in zip(c2w, pictures.mask, strict=True):
-        pixel, _, within = _pixels(pictures.camera, pose, points[alive])
+    for pose, mask, camera in zip(c2w, pictures.mask, pictures.cameras, strict=True):
+        pixel, _, within = _pixels(camera, pose, points[alive])
         against[alive] += within & ~mask.ravel()[pixel]
         watched[alive] += within
         alive = alive[against[alive] <= most]
@@ -119,9 +122,8 @@ def _colours(
     """
     import cv2
 
-    camera = pictures.camera
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
-    for pose, mask, rgb in zip(c2w, pictures.mask, pictures.rgb, strict=True):
+    for pose, mask, rgb, camera in zip(c2w, pictures.mask, pictures.rgb, pictures.cameras, strict=True):
         pixel, depth, within = _pixels(camera, pose, points)
         nearest = np.full(camera.width * camera.height, np.inf)
         np.minimum.at(nearest, pixel[within], depth[within])

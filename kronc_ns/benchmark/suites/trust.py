@@ -16,7 +16,7 @@ def trust_rows(shapes: Shapes) -> list[Row]:
         Row(
             "random captures",
             "4 to 80 views, hemispheres and walks of 0.15 to 1.5 laps, 0.5 to 4 px, up to 40 % outliers, 70 % missing "
-            f"and 30 % of views swapped, poor starts or none, focal lengths 10 to 30 % wrong, junk, two cars; {shapes}; "
+            f"and 30 % swapped views, poor starts or none, focal lengths 10 to 30 % wrong, junk, two cars; {shapes}; "
             "wrong: mean over the solved views above 3 deg or 0.5 m; off: by 5 deg; right: mean over all poses below "
             f"1.5 deg and 15 cm; intervals of {INTERVAL} sigma",
             1000,

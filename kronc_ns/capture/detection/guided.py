@@ -12,7 +12,7 @@ from kronc_ns.capture.detection.detector import CarDetection, CarImage
 from kronc_ns.capture.progress import Count
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
-from kronc_ns.geometry.camera import reproject
+from kronc_ns.geometry.camera import Camera, reproject
 from kronc_ns.geometry.poses import posed
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution, Status, ViewStatus
@@ -58,17 +58,17 @@ def look_again(
     detector: GuidedDetector, folder: Path, scene: Scene, solution: Solution, progress: Count | None = None
 ) -> Scene:
     """The scene with the points of views that have a pose detected anew near where the solved ones project."""
-    located = np.flatnonzero(posed(solution.c2w))
+    located = np.flatnonzero(posed(solution.c2w)).tolist()
     images = [CarImage(folder / scene.names[view]) for view in located]
     keypoints = scene.with_sides_swapped(np.array([view.swapped for view in solution.views])).keypoints.copy()
     sigma = np.ones(keypoints.shape[:2]) if scene.sigma_px is None else scene.sigma_px.copy()
-    size = np.array([scene.camera.width, scene.camera.height])
     answers = detector.look_again(images, expected_places(solution)[located])
     for count, (view, car) in enumerate(zip(located, answers, strict=True), start=1):
         if progress is not None:
             progress(count, len(images), None)
         if car is None or car.sigma_px is None:
             continue
+        size = scene.camera_of(view).width, scene.camera_of(view).height
         seen = (car.confidence > 0) & (car.uv >= 0).all(1) & (car.uv < size).all(1)
         keypoints[view] = np.where(seen[:, None], np.column_stack([car.uv, car.confidence]), 0.0)
         sigma[view] = np.where(seen, car.sigma_px, 0.0)
@@ -77,8 +77,20 @@ def look_again(
 
 def expected_places(solution: Solution) -> Float[np.ndarray, "n j 2"]:
     """Pixels (distorted, as detected) of the solved points in every view; NaN behind a camera or without a pose."""
-    uv = reproject(solution.points, solution.c2w, solution.camera)
-    return solution.camera.distort(np.where(np.isfinite(uv), uv, np.nan))
+    if solution.lenses is None:
+        return _as_detected(solution.points, solution.c2w, solution.camera)
+    uv = np.empty((len(solution.c2w), len(solution.points), 2))
+    for lens, camera in enumerate(solution.lenses.cameras):
+        own = solution.lenses.of_view == lens
+        uv[own] = _as_detected(solution.points, solution.c2w[own], camera)
+    return uv
+
+
+def _as_detected(
+    points: Float[np.ndarray, "j 3"], c2w: Float[np.ndarray, "n 3 4"], camera: Camera
+) -> Float[np.ndarray, "n j 2"]:
+    uv = reproject(points, c2w, camera)
+    return camera.distort(np.where(np.isfinite(uv), uv, np.nan))
 
 
 def is_better(second: Solution, first: Solution) -> bool:

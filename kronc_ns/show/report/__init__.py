@@ -72,7 +72,7 @@ def _page(record: dict[str, Any], scene: Scene, solution: Solution, folder: Path
 
 def _facts(scene: Scene, solution: Solution) -> list[tuple[str, str, str]]:
     """(what, figure, remark) of the summary."""
-    views, camera = solution.views, solution.camera
+    views = solution.views
     count = {status: sum(view.status is status for view in views) for status in ViewStatus}
     others = [
         f"{count[status]} {status.value}" for status in (ViewStatus.COMPLETED, ViewStatus.FAILED) if count[status]
@@ -90,7 +90,7 @@ def _facts(scene: Scene, solution: Solution) -> list[tuple[str, str, str]]:
         facts.append(("standard deviation", typical, f"median view; {worst}"))
     return [
         *facts,
-        ("focal length", f"{camera.fx:.1f} px", f"image {camera.width} × {camera.height}"),
+        _focal(solution),
         (
             "keypoints a view",
             f"{float(scene.visibility.sum(1).mean()):.1f}",
@@ -102,6 +102,14 @@ def _facts(scene: Scene, solution: Solution) -> list[tuple[str, str, str]]:
             f"from {solution.init} poses, {solution.iterations} steps, {solution.seconds:.2f} s",
         ),
     ]
+
+
+def _focal(solution: Solution) -> tuple[str, str, str]:
+    """Of all cameras."""
+    cameras = (solution.camera,) if solution.lenses is None else solution.lenses.cameras
+    sizes = dict.fromkeys(f"{camera.width} × {camera.height}" for camera in cameras)
+    what, images = ("focal length", "image") if len(cameras) == 1 else ("focal lengths", "images")
+    return (what, f"{', '.join(f'{camera.fx:.1f}' for camera in cameras)} px", f"{images} {', '.join(sizes)}")
 
 
 def _px(value: float) -> str:

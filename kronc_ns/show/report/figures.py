@@ -31,12 +31,12 @@ def cameras_3d(scene: Scene, solution: Solution) -> go.Figure | None:
     depth = frustum_depth(after if posed(after).any() else before)
     if posed(before).any():
         start = f"before: {solution.init}"
-        traces.append(_outlines(before[posed(before)], solution.camera, depth, name=start, meta="before", width=1))
+        traces.append(_outlines(solution, before, posed(before), depth, name=start, meta="before", width=1))
     for status in (ViewStatus.SOLVED, ViewStatus.COMPLETED):
         chosen = solution.views_that_are(status) & posed(after)
         if not chosen.any():
             continue
-        traces.append(_outlines(after[chosen], solution.camera, depth, name=status.value, meta=status.value))
+        traces.append(_outlines(solution, after, chosen, depth, name=status.value, meta=status.value))
         labels = [_label(view) for view, take in zip(solution.views, chosen.tolist(), strict=True) if take]
         traces.append(
             go.Scatter3d(
@@ -183,16 +183,27 @@ def _axis(values: Sequence[float]) -> dict:
 
 
 def _outlines(
-    c2w: Float[np.ndarray, "n 3 4"], camera: Camera, depth: float, name: str, meta: str, width: int = 2
+    solution: Solution,
+    c2w: Float[np.ndarray, "n 3 4"],
+    chosen: Bool[np.ndarray, "n"],
+    depth: float,
+    name: str,
+    meta: str,
+    width: int = 2,
 ) -> go.Scatter3d:
-    """Cameras as pyramids over their image."""
-    right, down = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
-    corners = [[-right, -down, 1], [right, -down, 1], [right, down, 1], [-right, down, 1]]
-    pyramid = depth * np.array([[0.0, 0.0, 0.0], *corners, [math.nan] * 3])
-    line = transform(c2w, np.broadcast_to(pyramid[[*_OUTLINE]], (len(c2w), len(_OUTLINE), 3))).reshape(-1, 3)
+    """Cameras of the chosen views as pyramids over their image."""
+    pyramids = [_pyramid(solution.camera_of(i)) for i in np.flatnonzero(chosen).tolist()]
+    line = transform(c2w[chosen], depth * np.stack(pyramids)).reshape(-1, 3)
     return go.Scatter3d(
         **_xyz(line), mode="lines", line={"width": width}, name=name, meta=meta, legendgroup=meta, hoverinfo="skip"
     )
+
+
+def _pyramid(camera: Camera) -> Float[np.ndarray, "o 3"]:
+    """Around the image at a distance of 1, by way of the centre; NaN lifts the pen."""
+    right, down = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
+    corners = [[-right, -down, 1], [right, -down, 1], [right, down, 1], [-right, down, 1]]
+    return np.array([[0.0, 0.0, 0.0], *corners, [math.nan] * 3])[[*_OUTLINE]]
 
 
 def _car(scene: Scene, points: Float[np.ndarray, "j 3"]) -> list[go.Scatter3d]:

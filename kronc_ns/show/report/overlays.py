@@ -78,7 +78,8 @@ def overlay(
 ) -> Overlay:
     """View ``i`` of a solution that lies in ``folder``."""
     view, keypoints = solution.views[i], scene.keypoints[i]
-    projected = _projected(solution.points, solution.c2w[i], solution.camera)
+    camera = solution.camera_of(i)
+    projected = _projected(solution.points, solution.c2w[i], camera)
     seen = keypoints[:, 2] > 0
     met = seen & np.isfinite(projected).all(1)
     error = np.linalg.norm(projected - keypoints[:, :2], axis=1)
@@ -97,9 +98,9 @@ def overlay(
     caption = f"{view.inliers} of {view.visible} keypoints explained"
     if view.rmse_px is not None:
         caption = f"RMSE {view.rmse_px:.2f} px, {caption}"
-    box = _around(np.concatenate([keypoints[seen, :2], projected[inlier[i]]]), scene.camera)
+    box = _around(np.concatenate([keypoints[seen, :2], projected[inlier[i]]]), camera)
     return Overlay(
-        kind, view.name, view.reason or caption, box, _picture(folder / scene.names[i], box, scene.camera), marks, lines
+        kind, view.name, view.reason or caption, box, _picture(folder / scene.names[i], box, camera), marks, lines
     )
 
 

@@ -2,7 +2,7 @@
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,16 +24,18 @@ class Cameras:
     def __init__(
         self,
         server: "viser.ViserServer",
-        camera: Camera,
+        cameras: Sequence[Camera],
         c2w: Float[np.ndarray, "n 3 4"],
         colours: UInt8[np.ndarray, "n 3"],
         on_click: Callable[[int], None],
     ) -> None:
         self._server, self._on_click = server, on_click
-        self._fov, self._aspect = 2 * math.atan2(camera.height / 2, camera.fy), camera.width / camera.height
+        self._fov = [2 * math.atan2(camera.height / 2, camera.fy) for camera in cameras]
+        self._aspect = [camera.width / camera.height for camera in cameras]
         # viser gives every frustum the same volume, whatever its field of view
-        slope = math.tan(self._fov / 2)
-        self._scale = frustum_depth(c2w) * (slope * slope * self._aspect / 3) ** (1 / 3)
+        slope = [math.tan(fov / 2) for fov in self._fov]
+        depth = frustum_depth(c2w)
+        self._scale = [depth * (s * s * a / 3) ** (1 / 3) for s, a in zip(slope, self._aspect, strict=True)]
         self._c2w, self._colours = c2w, colours
         self._thumbnails: dict[int, np.ndarray] = {}
         self._with_images, self._selected = True, -1
@@ -105,9 +107,9 @@ class Cameras:
         turn, centre = self.pose(i)
         handle = self._server.scene.add_camera_frustum(
             f"/cameras/{i + 1:04d}",
-            fov=self._fov,
-            aspect=self._aspect,
-            scale=self._scale,
+            fov=self._fov[i],
+            aspect=self._aspect[i],
+            scale=self._scale[i],
             color=self._colour_of(i),
             image=self._thumbnails.get(i) if self._with_images else None,
             wxyz=turn,

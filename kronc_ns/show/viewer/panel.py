@@ -44,7 +44,8 @@ class Viewer:
         self._share, self.selected = 1.0, -1
         server.scene.set_up_direction("+z")
         self._build_panel()
-        self.cameras = Cameras(server, solution.camera, solution.c2w, self._colours(), self.select)
+        own = [solution.camera_of(i) for i in range(len(solution.views))]
+        self.cameras = Cameras(server, own, solution.c2w, self._colours(), self.select)
         self.car = Car(server, scene, solution, self._inlier)
         self._draw_ground()
         server.on_client_connect(self._look_at_all)
@@ -186,7 +187,7 @@ class Viewer:
         if client is None or self.selected not in self.cameras.views:
             return
         wxyz, position = self.cameras.pose(self.selected)
-        camera = self._solution.camera
+        camera = self._solution.camera_of(self.selected)
         with client.atomic():
             client.camera.wxyz, client.camera.position = wxyz, position
             client.camera.fov = 2 * float(np.arctan2(camera.height / 2, camera.fy))
