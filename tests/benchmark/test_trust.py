@@ -85,7 +85,7 @@ def test_a_share_is_of_totals_and_not_a_mean_of_shares():
 
 def test_some_trials_of_the_tuning_numbers_keep_what_is_asked():
     """Few trials: a single scene that is right but weak may be too large a share."""
-    (row,) = trust_rows(Shapes())
+    row, _ = trust_rows(Shapes())
     measured = measure_row(row, range(TUNING_TRIALS, TUNING_TRIALS + 12))
     assert not measured.failures
     assert measured.reached["converged_wrong"] == 0

@@ -3,6 +3,7 @@
 from functools import lru_cache, partial
 
 from kronc_ns.benchmark.suites.captures import Shapes, random_car
+from kronc_ns.benchmark.suites.killed import killed
 from kronc_ns.benchmark.suites.pose_measures import INTERVAL
 from kronc_ns.benchmark.suites.rows import Limit, Row
 from kronc_ns.benchmark.suites.trials import TUNING_TRIALS, Shape, run_trial
@@ -11,7 +12,7 @@ _CARS = 40  # where no shapes are given
 
 
 def trust_rows(shapes: Shapes) -> list[Row]:
-    """One row of many trials."""
+    """Many trials, and many interruptions."""
     return [
         Row(
             "random captures",
@@ -31,7 +32,18 @@ def trust_rows(shapes: Shapes) -> list[Row]:
                 Limit("two_cars_converged", "total", at_most=0.0),
             ),
             {"total": ("scenes", "converged", "right", "views", "views_off", "junk", "two_cars")},
-        )
+        ),
+        Row(
+            "killed at random moments",
+            "`kronc solve`, `kronc-process-data`, the cache of `kronc-dataparser` in turn: kill -9, then run again",
+            50,
+            killed,
+            (
+                Limit("half_taken_for_whole", "total", at_most=0.0),
+                Limit("next_run_failed", "total", at_most=0.0),
+                Limit("killed", "total", at_least=30.0),
+            ),
+        ),
     ]
 
 
