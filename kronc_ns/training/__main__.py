@@ -96,11 +96,31 @@ class Calibrate:
         print(calibrate(self.weights, self.pictures, self.version))
 
 
+@dataclass(kw_only=True)
+class Worst:
+    """Draw the pictures that the network does worst on."""
+
+    pictures: Path
+    """Folder of shards that were not trained on."""
+    output: Path
+    """The sheet, a JPEG file."""
+    weights: Path | None = None
+    """The ONNX file (default: the builtin one)."""
+    count: int = 10
+
+    def run(self) -> None:
+        """Draw and say what was drawn."""
+        from kronc_ns.training.worst import worst_pictures
+
+        print(worst_pictures(self.weights, self.pictures, self.output, self.count))
+
+
 Command = (
     Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[Worst, tyro.conf.subcommand("worst")]
 )
 
 if __name__ == "__main__":
