@@ -14,7 +14,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from kronc_ns.capture.images import copy_upright, upright_size
-from kronc_ns.capture.source import IMAGE_SUFFIXES, list_images
+from kronc_ns.capture.photos import IMAGE_SUFFIXES, list_images
 from kronc_ns.errors import KroncError
 from kronc_ns.files.images import read_mask
 from kronc_ns.files.keypoints import FORMATS, match_keypoints, read_keypoints, write_keypoints

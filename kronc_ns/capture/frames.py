@@ -4,13 +4,12 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from PIL import Image
 
@@ -22,9 +21,10 @@ from kronc_ns.capture.images import (
     upright_size,
     write_downscales,
 )
+from kronc_ns.capture.photos import IMAGE_SUFFIXES
 from kronc_ns.capture.progress import Count
 from kronc_ns.capture.selection import Sampling
-from kronc_ns.capture.source import IMAGE_SUFFIXES, MIN_FRAMES, Source
+from kronc_ns.capture.source import MIN_FRAMES, Source
 from kronc_ns.capture.video import VideoFrames, probe_video
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import read_json, write_json
@@ -52,14 +52,16 @@ class Frames:
     reused: bool
     """They were there already, made from the same source by an earlier run."""
     note: str = ""
-    """What of a video was left out and why."""
+    """What of the source was left out and why."""
 
 
-def check_source(source: Source) -> tuple[int, int] | None:
-    """At least 3 readable images of one size, which is returned, or a readable video; looks at the headers only."""
+def check_source(source: Source, sampling: Sampling | None = None) -> tuple[int, int]:
+    """(width, height) of the upright frames, from the headers of images and the first frame of a video.
+
+    Raises `KroncError` unless there are at least 3 readable images of one size, or a readable video.
+    """
     if source.kind == "video":
-        probe_video(source.path)
-        return None
+        return probe_video(source.path, sampling or Sampling())
     if len(source.images) < MIN_FRAMES:
         raise KroncError(
             f"{source.path} holds {len(source.images)} images: expected at least {MIN_FRAMES} views of the car"
@@ -79,6 +81,14 @@ def check_source(source: Source) -> tuple[int, int] | None:
             f"{source.camera.width}x{source.camera.height}: expected intrinsics in the pixels of the images"
         )
     return first
+
+
+def plan_frames(source: Source, size: tuple[int, int], num_downscales: int = 3) -> Frames | None:
+    """What `prepare_frames` will make of images of ``size``; None for a video, whose frames are chosen on the way."""
+    if source.kind == "video":
+        return None
+    factors = downscale_factors(size, num_downscales)
+    return Frames(frame_names(source.images), source.names, size, factors, reused=False, note=source.note)
 
 
 def find_frames(source: Source, out: Path, sampling: Sampling | None = None, num_downscales: int = 3) -> Frames | None:
@@ -110,19 +120,19 @@ def prepare_frames(
     its transforms.json speaks of those pixels. Frames of an earlier run are removed first, but nothing in ``keep``.
     """
     signature = _signature(source, sampling or Sampling(), num_downscales)
+    count = progress or (lambda *_: None)
+    video = VideoFrames(source.path, sampling or Sampling(), count) if source.kind == "video" else None
     if (out / RECORD).exists() and source.reference is None:
         (out / "reference.json").unlink(missing_ok=True)  # of the frames that go now
     (out / RECORD).unlink(missing_ok=True)
     _clear(out, keep)
     (out / "images").mkdir(exist_ok=True)
-    count = progress or (lambda *_: None)
-    if source.kind == "video":
-        video = VideoFrames(source.path, sampling or Sampling(), count)
+    if video is not None:
         total = _for_each(partial(_write, out, num_downscales), enumerate(video, start=1))
         names = tuple(VIDEO_FRAME.format(number) for number in range(1, total + 1))
         source_names, note = names, video.note()
     else:
-        names, source_names, note = frame_names(source.images), source.names, ""
+        names, source_names, note = frame_names(source.images), source.names, source.note
         orient = source.camera is None
 
         def copy(image: Path, name: str) -> None:
@@ -147,41 +157,6 @@ def frame_names(images: Sequence[Path]) -> tuple[str, ...]:
         return tuple(f"images/{image.name}" for image in images)
     suffixes = (".jpg" if image.suffix.lower() in HEIF_SUFFIXES else image.suffix.lower() for image in images)
     return tuple(f"images/frame_{number:05d}{suffix}" for number, suffix in enumerate(suffixes, start=1))
-
-
-def copy_depths(source: Source, frames: Frames, out: Path) -> tuple[str, ...] | None:
-    """Copy the depth maps of a scene folder; their new paths."""
-    if source.depths is None:
-        return None
-    (out / "depths").mkdir(exist_ok=True)
-    stems = (PurePosixPath(name).stem for name in frames.names)
-    names = tuple(f"depths/{stem}{depth.suffix}" for stem, depth in zip(stems, source.depths, strict=True))
-    for depth, name in zip(source.depths, names, strict=True):
-        shutil.copyfile(depth, out / name)
-    return names
-
-
-def copy_reference(source: Source, frames: Frames, out: Path) -> None:
-    """Copy ``reference.json`` with the new names of the frames, for `kronc eval`."""
-    if source.reference is None:
-        return
-    content = read_json(source.reference)
-    listed = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(listed, list) or not all(isinstance(f, dict) and "file_path" in f for f in listed):
-        raise KroncError(
-            f'{source.reference}: expected "frames", a list of objects with "file_path"; mend or remove it'
-        )
-    renamed = dict(zip(source.names, frames.names, strict=True))
-    renamed |= {PurePosixPath(old).name: new for old, new in renamed.items()}
-    known = []
-    for frame in listed:
-        old = str(frame["file_path"])
-        name = renamed.get(old) or renamed.get(PurePosixPath(old).name)
-        if name is not None:
-            poses_only = {key: value for key, value in frame.items() if not key.endswith("_path")}
-            known.append({"file_path": name, **poses_only})
-    without_files = {key: value for key, value in content.items() if not key.endswith("_path")}
-    write_json(out / "reference.json", {**without_files, "frames": known})
 
 
 def _write(out: Path, num_downscales: int, number: int, frame: Image.Image) -> None:
@@ -222,11 +197,15 @@ def _for_each(work: Callable[..., None], items: Iterable[tuple], progress: Calla
 
 
 def _signature(source: Source, sampling: Sampling, num_downscales: int) -> str:
-    """Hash of everything the frames depend on: files by path, size and time of change."""
-    files: Iterable[Path] = source.images or (source.path,)
+    """Hash of everything the frames depend on: files by path, size and time of change.
+
+    Photos that were left out count, so that frames are known again before duplicates are looked for.
+    """
+    files = sorted((*source.images, *source.left_out)) if source.kind == "photos" else source.images or [source.path]
     states = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    settings = [asdict(sampling) if source.kind == "video" else None, num_downscales]
-    text = json.dumps([states, source.names, source.camera is None, settings])
+    names = source.names if source.kind == "scene folder" else None
+    settings = {"photos": sampling.keep_duplicates, "video": asdict(sampling)}.get(source.kind)
+    text = json.dumps([states, names, source.camera is None, settings, num_downscales])
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -7,14 +7,17 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import ExifTags, Image, ImageOps
+from PIL.TiffImagePlugin import TiffImageFile
 
+from kronc_ns.capture.pixel_modes import is_plain, plain
 from kronc_ns.errors import KroncError
 
 _READ_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
 HEIF_SUFFIXES = (".heic", ".heif")
 """Photos that `read_heif` lets be read, in lower case."""
+_JPEG = {"quality": 95, "subsampling": 0}
+_CODING = {".jpg": _JPEG, ".jpeg": _JPEG, ".webp": {"quality": 95}, ".png": {"compress_level": 3}}
 _SMALLEST_SIDE = 100  # px; below, a downscaled copy shows nothing to train on
 
 
@@ -28,30 +31,23 @@ def read_heif(path: Path) -> None:
 
 
 def load_image(path: Path) -> Image.Image:
-    """The whole decoded image as it is stored (EXIF orientation not applied), 8 bits a channel."""
-    image = _load(path)
-    if image.mode.startswith(("I", "F")):
-        raise KroncError(f"{path} has {image.mode} pixels: expected 8 bits a channel; convert it")
-    return image
+    """The whole decoded image as it is stored (EXIF orientation not applied) as 8-bit grey, RGB or RGBA."""
+    return _load(path)[0]
 
 
 def load_small(path: Path, long_side: int) -> Image.Image:
-    """The image as it is stored, as cheaply as its format allows, not below ``long_side`` px where it is larger.
+    """`load_image`, as cheaply as the format allows, not below ``long_side`` px where it is larger.
 
-    JPEG is decoded at a half, a quarter or an eighth; 16-bit grey becomes 8-bit.
+    JPEG is decoded at a half, a quarter or an eighth.
     """
-    image = _load(path, long_side)
-    if image.mode.startswith("I"):
-        # 16-bit files may come as 32-bit pixels
-        return Image.fromarray((np.asarray(image, dtype=np.int64).clip(0, 65535) // 257).astype(np.uint8))
-    if image.mode.startswith("F"):
-        raise KroncError(f"{path} has floating-point pixels: expected 8 or 16 bits a channel; convert it")
-    return image
+    return _load(path, long_side)[0]
 
 
-def _load(path: Path, long_side: int | None = None) -> Image.Image:
+def _load(path: Path, long_side: int | None = None) -> tuple[Image.Image, bool]:
+    """The image, and whether the file holds such pixels itself."""
     try:
         with Image.open(path) as image:
+            as_stored = is_plain(image)
             if long_side is not None and max(image.size) > long_side:
                 factor = long_side / max(image.size)
                 image.draft(None, (math.ceil(factor * image.width), math.ceil(factor * image.height)))
@@ -59,9 +55,13 @@ def _load(path: Path, long_side: int | None = None) -> Image.Image:
     except FileNotFoundError:
         raise KroncError(f"{path} does not exist") from None
     except _READ_ERRORS as error:
-        reason = "no image format" if "cannot identify" in str(error) else str(error)
-        raise KroncError(f"{path} is no image that can be read ({reason}): replace or remove it") from None
-    return image
+        raise _unreadable(path, error) from None
+    return plain(image, path), as_stored
+
+
+def _unreadable(path: Path, error: Exception) -> KroncError:
+    reason = "no image format" if "cannot identify" in str(error) else str(error)
+    return KroncError(f"{path} is no image that can be read ({reason}): replace or remove it")
 
 
 def is_turned(image: Image.Image) -> bool:
@@ -70,34 +70,40 @@ def is_turned(image: Image.Image) -> bool:
 
 
 def upright_size(path: Path, orient: bool = True) -> tuple[int, int]:
-    """(width, height) as shown, from the header alone; with ``orient`` False as stored."""
+    """(width, height) as shown, from the header alone; with ``orient`` False as stored.
+
+    TIFF is always upright: Pillow turns it while reading, and trainers read with Pillow.
+    """
     try:
         with Image.open(path) as image:
             width, height = image.size
-            swapped = orient and image.getexif().get(ExifTags.Base.Orientation, 1) in range(5, 9)
+            turned = image.getexif().get(ExifTags.Base.Orientation, 1) in range(5, 9)
+            if isinstance(image, TiffImageFile):  # some versions of Pillow give the size upright, some as stored
+                width, height = (image.tag_v2[tag] for tag in (ExifTags.Base.ImageWidth, ExifTags.Base.ImageLength))
+                orient = True
     except _READ_ERRORS as error:
-        reason = "no image format" if "cannot identify" in str(error) else str(error)
-        raise KroncError(f"{path} is no image that can be read ({reason}): replace or remove it") from None
-    return (height, width) if swapped else (width, height)
+        raise _unreadable(path, error) from None
+    return (height, width) if turned and orient else (width, height)
 
 
 def copy_upright(source: Path, target: Path, orient: bool = True) -> Image.Image:
-    """Copy a photo with its EXIF orientation applied; byte for byte where there is none. Returns the image.
+    """Copy a photo with its EXIF orientation applied; byte for byte where trainers read its pixels. Returns the image.
 
-    HEIF, which few programs read, is coded anew in the format of ``target``.
+    HEIF, and pixels other than 8-bit grey, RGB and RGBA, are coded anew in the format of ``target``.
     """
-    image = load_image(source)
-    if (orient and is_turned(image)) or source.suffix.lower() in HEIF_SUFFIXES:
-        upright = ImageOps.exif_transpose(image)
-        if source.suffix.lower() in HEIF_SUFFIXES:
-            upright = upright.convert("RGB")  # JPEG has no alpha
-        options: dict[str, Any] = (
-            {"quality": 95, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
-        )
-        upright.save(target, exif=upright.getexif(), icc_profile=image.info.get("icc_profile"), **options)
-        return upright
-    shutil.copyfile(source, target)
-    return image
+    image, as_stored = _load(source)
+    heif = source.suffix.lower() in HEIF_SUFFIXES
+    if as_stored and not heif and not (orient and is_turned(image)):
+        shutil.copyfile(source, target)
+        return image
+    upright = ImageOps.exif_transpose(image) if orient or heif else image
+    if target.suffix.lower() in (".jpg", ".jpeg") and upright.mode == "RGBA":
+        upright = upright.convert("RGB")  # JPEG has no alpha
+    options: dict[str, Any] = _CODING.get(target.suffix.lower(), {})
+    # of a TIFF's tags some say how its own pixels lie
+    exif = {} if target.suffix.lower() in (".tif", ".tiff") else {"exif": upright.getexif()}
+    upright.save(target, icc_profile=upright.info.get("icc_profile"), **exif, **options)
+    return upright
 
 
 def downscale_factors(size: tuple[int, int], num_downscales: int) -> tuple[int, ...]:
@@ -112,8 +118,6 @@ def downscale(image: Image.Image, factor: int) -> Image.Image:
     Left-over rows and columns are cut off, so that pixels scale by ``factor`` exactly, as nerfstudio assumes of
     the intrinsics.
     """
-    if image.mode in ("P", "1"):
-        image = image.convert("RGBA" if "transparency" in image.info else "L" if image.mode == "1" else "RGB")
     width, height = (side // factor * factor for side in image.size)
     return image.reduce(factor, box=(0, 0, width, height))
 

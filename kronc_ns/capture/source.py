@@ -1,7 +1,5 @@
 """What the user points at: a scene folder, a folder of photos, or a video."""
 
-import re
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -10,15 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from kronc_ns.capture.images import HEIF_SUFFIXES, read_heif
+from kronc_ns.capture.photos import PHOTO_SUFFIXES, find_photos, relative_names, told_of
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import read_json
 from kronc_ns.files.transforms import camera_and_frames, read_poses
 from kronc_ns.geometry.camera import Camera
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-"""Image files that are taken, in lower case."""
-PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
-"""What is taken of a folder of photos."""
 MIN_FRAMES = 3
 """Fewer views cannot be solved."""
 
@@ -45,6 +40,10 @@ class Source:
     """Keypoint file or folder that lies with the images."""
     reference: Path | None = None
     """``reference.json``: trusted poses, for `kronc eval`."""
+    note: str = ""
+    """What of the folder was left out and why."""
+    left_out: tuple[Path, ...] = ()
+    """Photos that are not among `images`, since they show nothing new."""
 
 
 def find_source(data: Path) -> Source:
@@ -69,44 +68,18 @@ def find_images(data: Path) -> Source:
     return find_source(data)
 
 
-def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key under which img2 comes before img10."""
-    return [
-        (0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in re.split(r"(\d+)", name) if part
-    ]
-
-
-def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> tuple[Path, ...]:
-    """Image files of a folder (no subfolders, no hidden files), naturally sorted."""
-    files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and not f.name.startswith(".") and f.is_file()]
-    return tuple(sorted(files, key=lambda file: natural_key(file.name)))
-
-
 def _photos(data: Path) -> Source:
-    folder = data
-    images = list_images(data, PHOTO_SUFFIXES)
-    if not images and (data / "images").is_dir():
-        folder = data / "images"
-        images = list_images(folder, PHOTO_SUFFIXES)
-    if not images:
-        others = Counter(f.suffix.lower() for f in folder.iterdir() if f.is_file() and f.suffix)
-        found = ", ".join(f"{count} {suffix}" for suffix, count in others.most_common(3)) or "no files"
-        raise KroncError(
-            f"{folder} holds no images that can be read ({found}): expected {', '.join(PHOTO_SUFFIXES)}, "
-            "a transforms.json, or as --data a video file itself"
-        )
-    if heif := next((image for image in images if image.suffix.lower() in HEIF_SUFFIXES), None):
-        read_heif(heif)
-    names = tuple(image.name for image in images)
+    folder, images = find_photos(data)
     masks = data / "masks"
     return Source(
         data,
         "photos",
         images,
-        names,
+        relative_names(folder, images),
         masks=masks if masks.is_dir() else None,
         keypoints=_own_keypoints(data, folder),
         reference=_if_file(data / "reference.json"),
+        note=told_of(folder, images),
     )
 
 
@@ -139,9 +112,15 @@ def _scene(data: Path) -> Source:
 
 
 def _listed(data: Path, frames: list[dict], key: str) -> tuple[Path, ...] | None:
-    """Paths under ``key``; None unless every frame has one. A listed file that is missing is an error."""
-    if not all(frame.get(key) for frame in frames):
+    """Paths under ``key``; None where no frame has one. Some without, or a file that is missing, is an error."""
+    without = [frame for frame in frames if not frame.get(key)]
+    if len(without) == len(frames):
         return None
+    if without:
+        raise KroncError(
+            f"{data / 'transforms.json'}: frame {without[0]['file_path']} lacks a {key} that others have "
+            f"({len(without)} of {len(frames)} lack it): give all or none"
+        )
     paths = tuple(data / PurePosixPath(str(frame[key])) for frame in frames)
     missing = [path for path in paths if not path.is_file()]
     if missing:

@@ -100,10 +100,25 @@ class VideoFrames:
             yield Candidate(frame, slot, _grey(frame))
 
 
-def probe_video(video: Path) -> None:
-    """Raise `KroncError` unless ffmpeg's libraries find a video stream in the file."""
-    with _opened(video):
-        pass
+def probe_video(video: Path, sampling: Sampling) -> tuple[int, int]:
+    """(width, height) of the upright frames, from the first one that can be decoded.
+
+    Raises `KroncError` where there is none, or the video is too short for ``sampling``.
+    """
+    with _opened(video) as container:
+        stream = container.streams.video[0]
+        promised_s = _promised_s(container)
+        if sampling.fps is not None and promised_s and promised_s * sampling.fps < MIN_FRAMES - 1:
+            raise KroncError(
+                f"{video} lasts {promised_s:.1f} s, of which --fps {sampling.fps:g} takes fewer than {MIN_FRAMES} "
+                f"frames: expected at least {MIN_FRAMES} views of the car; raise --fps, or leave it out"
+            )
+        frame = next((frame for frame in _decode(container) if frame is not None), None)
+        if frame is None:
+            codec = stream.codec_context.name
+            raise KroncError(f"{video}: none of its frames ({codec}) can be decoded: expected a video that plays")
+        turned = round(frame.rotation / 90) % 2
+        return (frame.height, frame.width) if turned else (frame.width, frame.height)
 
 
 def read_timeline(video: Path) -> Timeline:
@@ -115,7 +130,7 @@ def read_timeline(video: Path) -> Timeline:
             for packet in container.demux(stream):
                 if packet.size and not packet.is_discard:
                     times.append(packet.pts)
-        promised_s = float((stream.duration or 0) * (stream.time_base or 0)) or (container.duration or 0) / av.time_base
+        promised_s = _promised_s(container)
         known = sorted(time for time in times if time is not None)
         timed = len(known) == len(times) > 1 and known[-1] > known[0] and stream.time_base is not None
         if not timed:
@@ -124,6 +139,11 @@ def read_timeline(video: Path) -> Timeline:
         span = known[-1] - known[0]
         step = max(1, round(span / (len(known) - 1)))
         return Timeline(known[0], span + step, len(known), Fraction(stream.time_base or 1), True, promised_s)
+
+
+def _promised_s(container: InputContainer) -> float:
+    stream = container.streams.video[0]
+    return float((stream.duration or 0) * (stream.time_base or 0)) or (container.duration or 0) / av.time_base
 
 
 @contextmanager

@@ -88,16 +88,25 @@ Kind = Literal["solution", "data set", "capture"]
 """What an output folder holds: poses alone; poses with the frames and detections they came from; a scene to solve."""
 
 
-def claim_output(folder: Path, kind: Kind = "solution") -> None:
-    """Make ``folder`` ours to write: new, empty, or holding an earlier (also an interrupted) result of this ``kind``.
-
-    Raises `KroncError` where it holds anything else.
-    """
+def check_output(folder: Path, kind: Kind = "solution") -> None:
+    """Raise `KroncError` where `claim_output` would, before work whose result could not be written; writes nothing."""
     if folder.exists() and not folder.is_dir():
         raise KroncError(f"{folder} is a file: expected a folder for the output")
     if folder.is_dir() and any(folder.iterdir()) and (held := _held(folder)) not in (kind, ""):
         what = "data that kronc did not write" if held is None else f"a {held}, which is not for a {kind} to replace"
         raise KroncError(f"{folder} already holds {what}: choose a new or empty folder")
+    there = next(path for path in (folder, *folder.resolve().parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        what = "is not writable" if there.is_dir() else "is a file"
+        raise KroncError(f"{folder} cannot be written: {there} {what}; choose another output folder")
+
+
+def claim_output(folder: Path, kind: Kind = "solution") -> None:
+    """Make ``folder`` ours to write: new, empty, or holding an earlier (also an interrupted) result of this ``kind``.
+
+    Raises `KroncError` where it holds anything else.
+    """
+    check_output(folder, kind)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MARKER).write_text(kind)

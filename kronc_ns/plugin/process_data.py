@@ -15,26 +15,28 @@ from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.capture.detection.detector import Detector
 from kronc_ns.capture.detection.finding import find_keypoints
 from kronc_ns.capture.detection.guided import GuidedDetector, second_look
-from kronc_ns.capture.frames import Frames, check_source, copy_depths, copy_reference, find_frames, prepare_frames
+from kronc_ns.capture.duplicates import without_duplicates
+from kronc_ns.capture.frames import Frames, check_source, find_frames, plan_frames, prepare_frames
 from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics, read_calibration
-from kronc_ns.capture.masks import find_masks, write_masks
+from kronc_ns.capture.masks import check_masks, find_masks, write_masks
+from kronc_ns.capture.matching import Matched, match_frames
 from kronc_ns.capture.segmentation.choice import SegmenterOptions, segment_car
 from kronc_ns.capture.segmentation.segmenter import Segmenter
 from kronc_ns.capture.selection import Sampling
+from kronc_ns.capture.sidecars import check_sidecars, copy_depths, copy_reference
 from kronc_ns.capture.source import Source, find_source
 from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, report_table, solving
-from kronc_ns.commands.options import SolverOptions
+from kronc_ns.commands.options import Flag, SolverOptions
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import fingerprint
-from kronc_ns.files.keypoints import FORMATS, Detections, read_keypoints, sigma_of, write_keypoints
-from kronc_ns.files.output import claim_output, write_json
+from kronc_ns.files.keypoints import FORMATS, Detections, read_keypoints, write_keypoints
+from kronc_ns.files.output import check_output, claim_output, write_json
 from kronc_ns.files.record import write_solution
-from kronc_ns.files.scene_folder import load_scene, match_keypoints
+from kronc_ns.files.scene_folder import load_scene
 from kronc_ns.files.transforms import transforms_dict
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.fit.starts import MIN_POINTS
-from kronc_ns.geometry.camera import Camera
 from kronc_ns.scene import Scene
 from kronc_ns.show.report import write_report
 from kronc_ns.solution import Solution, Status
@@ -56,13 +58,16 @@ class KroncToNerfstudio:
     detection: Annotated[DetectorOptions, tyro.conf.arg(name="")] = field(default_factory=DetectorOptions)
     """How keypoints are found, where no file holds them."""
     masks: Path | None = None
-    """Folder with a mask for each image, of the same stem: above 127 the car, else ignored."""
+    """Folder with a mask for each image, of the same stem (in the same subfolder), or one image for all: above 127 the
+    car, else ignored. Default: those of transforms.json, or DATA/masks, if any."""
     segmentation: Annotated[SegmenterOptions, tyro.conf.arg(name="")] = field(default_factory=SegmenterOptions)
     """How masks are made, where there are none."""
     num_frames: int = 100
     """Frames taken from a video: the sharpest of as many equal spans of time, unless nothing has moved."""
     fps: float | None = None
     """Frames per second taken from a video, sharp or not, instead (5 in the paper)."""
+    keep_duplicates: Flag = False
+    """Take also photos and frames that show nothing new; of a row of those, the sharpest is taken otherwise."""
     focal_length_px: float | None = None
     """Focal length in pixels of the full-size image. Default: from transforms.json, else from EXIF."""
     camera: Path | None = None
@@ -89,32 +94,46 @@ class KroncToNerfstudio:
         """Process; raises `KroncError` for what the user can mend. Returns 3 for a doubtful solution, else 0."""
         config = self.solve.solver_config()
         self._check_options()
-        source = find_source(self.data)
+        source, out = find_source(self.data), self.output_dir
         given = self.keypoints or source.keypoints
+        check_output(out, "data set")  # all that is wrong is told before the work begins
+        if config.init == "given" and source.c2w is None:
+            raise KroncError(
+                f"--init given: {self.data} has no transforms.json with a pose for every frame: use --init auto"
+            )
         detector = self.detection.make(default="builtin" if given is None else "none")
         segmenter = self.segmentation.make()
-        if source.depths is None:  # what is missing is told before the work begins
+        if source.depths is None:
             depth_estimator(config, self.depth_weights)
-        size = check_source(source)
+        sampling = Sampling(self.num_frames, self.fps, self.keep_duplicates)
+        size = check_source(source, sampling)
+        check_sidecars(source)
         found = None if detector else self._read_keypoints(source, given)
-        early = None if size is None else self._intrinsics(source, size)
-        out = self.output_dir
-        settings = (Sampling(self.num_frames, self.fps), self.num_downscales)
-        frames = find_frames(source, out, *settings)
+        intrinsics = self._intrinsics(source, size)
+        every_name = source.names
+        frames = find_frames(source, out, sampling, self.num_downscales)
         if frames is None and self.keypoints is not None and self.keypoints.resolve().is_relative_to(out.resolve()):
             raise KroncError(
                 f"the frames in {out / 'images'} are not of this command, so the keypoints beside them do not fit: "
                 "repeat the options of the first run, or run without --keypoints and detect anew"
             )
+        if frames is None and not self.keep_duplicates:
+            with progress_bar("comparing photos") as progress:
+                source = without_duplicates(source, size, progress)
+        planned = frames or plan_frames(source, size, self.num_downscales)
+        given_masks = None if segmenter else self.masks or source.masks
+        if given_masks is not None:
+            check_masks(given_masks, planned, size)
+        if found is not None and planned is not None:
+            match_frames(found, every_name, planned, intrinsics.camera)
         claim_output(out, "data set")
         if frames is None:
             with progress_bar("frames") as progress:
-                keep = [self.masks] if self.masks else []
-                frames = prepare_frames(source, out, *settings, keep=keep, progress=progress)
-        intrinsics = early or self._intrinsics(source, frames.size)
+                keep = [self.masks if self.masks.is_dir() else self.masks.parent] if self.masks else []
+                frames = prepare_frames(source, out, sampling, self.num_downscales, keep, progress)
         if intrinsics.assumed:
             print(_assumption(intrinsics), file=sys.stderr)
-        masks, mask_note = self._write_masks(segmenter, source, frames)
+        masks, mask_note = self._write_masks(segmenter, given_masks, frames)
         transforms = transforms_dict(
             intrinsics.camera, frames.names, source.c2w, masks, copy_depths(source, frames, out)
         )
@@ -125,7 +144,8 @@ class KroncToNerfstudio:
         if found is None:
             print(_how_to_go_on(frames, out))
             return 0
-        note = _write_keypoints(found, frames, intrinsics.camera, masks, out)
+        mask_files = [out / mask for mask in masks] if masks else None
+        note = _write_keypoints(match_frames(found, every_name, frames, intrinsics.camera, mask_files), frames, out)
 
         scene = load_scene(out)
         if intrinsics.assumed and config.solver == "lm":
@@ -169,8 +189,11 @@ class KroncToNerfstudio:
             raise KroncError(f"--keypoints {self.keypoints} and --detector {self.detection.detector}: give one of them")
         if self.masks is not None and self.segmentation.segmenter is not None:
             raise KroncError(f"--masks {self.masks} and --segmenter {self.segmentation.segmenter}: give one of them")
-        if self.masks is not None and not self.masks.is_dir():
-            raise KroncError(f"--masks {self.masks} is no folder: expected one mask image per photo, of the same stem")
+        if self.masks is not None and not self.masks.exists():
+            raise KroncError(
+                f"--masks {self.masks} is no folder and no image: expected a mask for each photo, of the same stem, or "
+                "one for all"
+            )
 
     def _read_keypoints(self, source: Source, given: Path | None) -> Detections | None:
         """Detections of a file, or None where frames alone are wanted."""
@@ -194,7 +217,7 @@ class KroncToNerfstudio:
         return find_intrinsics(size, source.images, given, self.focal_length_px, self.fov_deg, given_by)
 
     def _write_masks(
-        self, segmenter: Segmenter | None, source: Source, frames: Frames
+        self, segmenter: Segmenter | None, given: Path | tuple[Path, ...] | None, frames: Frames
     ) -> tuple[tuple[str, ...] | None, str]:
         """Paths of the masks, if there are any, and a note on how they were made."""
         out = self.output_dir
@@ -202,8 +225,7 @@ class KroncToNerfstudio:
             with TemporaryDirectory(prefix="kronc-masks-") as folder, progress_bar("segmenting") as progress:
                 files, note = segment_car(segmenter, [out / name for name in frames.names], Path(folder), progress)
                 return write_masks(files, frames, out), note
-        masks = self.masks or source.masks
-        return (None if masks is None else write_masks(find_masks(masks, frames), frames, out)), ""
+        return (None if given is None else write_masks(find_masks(given, frames), frames, out)), ""
 
 
 def extend_commands(script: ModuleType) -> None:
@@ -244,26 +266,15 @@ def _seen(scene: Scene) -> str:
     return f"{enough} of {len(counts)} frames with {MIN_POINTS} or more, {counts.mean():.1f} a frame{missing}"
 
 
-def _write_keypoints(
-    found: Detections, frames: Frames, camera: Camera, masks: tuple[str, ...] | None, out: Path
-) -> str:
-    """Write the detections of one car as OUT/keypoints.json under the new names; a note on choices made."""
+def _write_keypoints(matched: Matched, frames: Frames, out: Path) -> str:
+    """Write keypoints of one car as OUT/keypoints.json under the new names; a note on choices made."""
     target = out / "keypoints.json"
-    if found.source.resolve() == target.resolve():
+    if matched.source.resolve() == target.resolve():
         return ""
-    names = frames.source_names if _covers(frames.source_names, found) else frames.names
-    if not _covers(names, found):
-        names = frames.source_names
-    rows, note = match_keypoints(found, names, camera, [out / mask for mask in masks] if masks else None)
-    sigma = sigma_of(found, names, rows)
-    write_keypoints(target, found.schema, frames.size, dict(zip(frames.names, rows, strict=True)), sigma)
-    return note
-
-
-def _covers(names: tuple[str, ...], found: Detections) -> bool:
-    """Whether every image that ``found`` knows has one of these paths or file names."""
-    files = {Path(name).name for name in names}
-    return all(Path(key).name in files for key in found.frames)
+    write_keypoints(
+        target, matched.schema, frames.size, dict(zip(frames.names, matched.rows, strict=True)), matched.sigma_px
+    )
+    return matched.note
 
 
 def _assumption(intrinsics: Intrinsics) -> str:

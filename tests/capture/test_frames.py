@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from kronc_ns.capture.frames import Frames, check_source, copy_reference, find_frames, frame_names, prepare_frames
+from kronc_ns.capture.frames import Frames, check_source, find_frames, frame_names, prepare_frames
 from kronc_ns.capture.images import downscale, downscale_factors
 from kronc_ns.capture.intrinsics import read_exif_focal
 from kronc_ns.capture.masks import downscale_mask, find_masks, write_masks
-from kronc_ns.capture.source import find_source, natural_key
+from kronc_ns.capture.photos import natural_key
+from kronc_ns.capture.sidecars import copy_reference
+from kronc_ns.capture.source import find_source
 from kronc_ns.errors import KroncError
 from kronc_ns.files.images import read_mask
 

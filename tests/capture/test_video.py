@@ -7,6 +7,7 @@ import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -57,6 +58,15 @@ def remux(source: Path, target: Path, *options: str, before: tuple[str, ...] = (
     subprocess.run(
         ["ffmpeg", "-v", "error", "-y", *before, "-i", str(source), "-c", "copy", *options, str(target)], check=True
     )
+    return target
+
+
+def turn(plain: Path, target: Path, angle: int) -> Path:
+    """Give a video a display matrix."""
+    remux(plain, target, "-map", "0", "-metadata:s:v:0", f"rotate={angle}")
+    probe = subprocess.run(["ffprobe", "-v", "error", "-show_streams", str(target)], capture_output=True, text=True)
+    if "rotation=" not in probe.stdout:  # ffmpeg from 7 on
+        remux(plain, target, "-map", "0", before=("-display_rotation", str(angle)))
     return target
 
 
@@ -169,15 +179,82 @@ def test_a_short_video_gives_all_its_frames(tmp_path: Path):
 
 @pytest.mark.parametrize("angle", [90, 180, 270])
 def test_frames_stand_upright(tmp_path: Path, angle: int):
-    plain = film(tmp_path / "plain.mp4", [view(20.0 * i) for i in range(4)])
-    turned = remux(plain, tmp_path / "turned.mp4", "-metadata:s:v:0", f"rotate={angle}")
-    probe = subprocess.run(["ffprobe", "-v", "error", "-show_streams", str(turned)], capture_output=True, text=True)
-    if "rotation=" not in probe.stdout:  # ffmpeg from 7 on
-        remux(plain, turned, before=("-display_rotation", str(angle)))
+    turned = turn(film(tmp_path / "plain.mp4", [view(20.0 * i) for i in range(4)]), tmp_path / "turned.mp4", angle)
     images, _ = taken(turned)
     assert images[0].shape == ((WIDTH, HEIGHT, 3) if angle != 180 else (HEIGHT, WIDTH, 3))
     for image, expected in zip(images, ffmpegs_frames(turned, tmp_path / "ffmpeg"), strict=True):
         np.testing.assert_array_equal(image, expected)
+
+
+def test_a_phones_video_is_upright_in_its_colours_and_spread_over_time(tmp_path: Path):
+    """HEVC of 10 bits in .MOV, held upright (a display matrix), sound first, the rate falling to a third later on."""
+    encoders = subprocess.run(["ffmpeg", "-hide_banner", "-encoders"], capture_output=True, text=True, check=True)
+    if " libx265 " not in encoders.stdout:
+        pytest.skip("this ffmpeg has no encoder for HEVC (libx265)")
+    originals = [np.ascontiguousarray(cv2.GaussianBlur(view(4.0 * i), (0, 0), 1.5)) for i in range(120)]
+    constant = film(tmp_path / "constant.mkv", originals, 30)
+    slower = "select='lt(t,2)+not(mod(n,3))',scale=out_color_matrix=bt709"
+    hevc = ("-c:v", "libx265", "-x265-params", "log-level=error:crf=6", "-pix_fmt", "yuv420p10le", "-tag:v", "hvc1")
+    sound = ("-f", "lavfi", "-i", "sine=duration=4")
+    streams = ("-map", "0:a", "-map", "1:v", "-vf", slower, "-vsync", "vfr", *hevc, "-colorspace", "bt709")
+    lying = tmp_path / "lying.mov"
+    subprocess.run(["ffmpeg", "-v", "error", *sound, "-i", str(constant), *streams, str(lying)], check=True)
+    phone = turn(lying, tmp_path / "IMG_0001.MOV", 90)
+    with av.open(str(phone)) as container:
+        assert container.streams[0].type == "audio"
+        assert container.streams.video[0].codec_context.pix_fmt == "yuv420p10le"
+    assert check_source(find_source(phone)) == (HEIGHT, WIDTH)
+
+    quarter = (
+        1
+        if which(ffmpegs_frames(phone, tmp_path / "upright")[0], [np.rot90(originals[0]), np.rot90(originals[0], -1)])
+        == 0
+        else -1
+    )
+    # turned by us: ffmpeg turns 10 bits before it interpolates chroma, which is not the same
+    shown = [np.rot90(frame, quarter) for frame in ffmpegs_frames(lying, tmp_path / "lying")]
+    upright = [np.rot90(original, quarter) for original in originals]
+    images, note = taken(phone, num_frames=8)
+    assert note == ""
+    seconds = np.array([which(image, upright) for image in images]) / 30
+    assert np.abs(seconds - (np.arange(8) + 0.5) * 0.5).max() < 0.3
+    for image in images:
+        assert image.shape == (WIDTH, HEIGHT, 3)
+        assert np.abs(image.astype(int) - shown[which(image, shown)]).max() <= 1
+        assert np.abs(image.astype(int) - upright[which(image, upright)]).mean() < 8  # chroma of half the size
+    plain, _ = taken(phone, fps=2.0)
+    np.testing.assert_allclose([which(image, upright) / 30 for image in plain], np.arange(8) / 2, atol=0.1 + 1e-9)
+
+
+def test_the_size_of_a_video_is_known_before_its_frames(tmp_path: Path):
+    video = film(tmp_path / "walk.mp4", [view(20.0 * i) for i in range(60)])
+    assert check_source(find_source(video)) == (WIDTH, HEIGHT)
+    assert check_source(find_source(turn(video, tmp_path / "turned.mp4", 90))) == (HEIGHT, WIDTH)
+    assert check_source(find_source(turn(video, tmp_path / "head.mp4", 180))) == (WIDTH, HEIGHT)
+
+
+def test_a_rate_that_gives_too_few_frames_is_named_at_once(tmp_path: Path):
+    video = film(tmp_path / "walk.mp4", [view(20.0 * i) for i in range(60)])
+    with pytest.raises(KroncError, match=r"walk\.mp4 lasts 2\.0 s, of which --fps 0\.9 takes fewer than 3 frames"):
+        check_source(find_source(video), Sampling(fps=0.9))
+    check_source(find_source(video), Sampling(fps=1.5))
+
+
+def test_a_video_of_nothing_but_damage_is_named_at_once(tmp_path: Path):
+    video = film(tmp_path / "walk.mp4", [view(20.0 * i) for i in range(20)])
+    content = bytearray(video.read_bytes())
+    start, end = content.find(b"mdat") + 4, content.rfind(b"moov") - 4
+    content[start:end] = bytes(end - start)
+    video.write_bytes(content)
+    with pytest.raises(KroncError, match=r"walk\.mp4: none of its frames \(h264\) can be decoded"):
+        check_source(find_source(video))
+
+
+def test_duplicates_are_taken_where_they_are_wanted(tmp_path: Path):
+    video = film(tmp_path / "still.mp4", [view(0.0)] * 30)
+    images, note = taken(video, num_frames=10, keep_duplicates=True)
+    assert len(images) == 10
+    assert note == ""
 
 
 @pytest.mark.parametrize(
