@@ -175,6 +175,8 @@ def _keypoints(
     for path in candidates:
         if path.is_file() or any(path.glob("*.predictions.json")):
             found = read_keypoints(path)
+            if found.notes:  # a data set is published whole
+                raise KroncError(f"{'; '.join(found.notes)}: expected numbers, or confidence 0 for what is not seen")
             return found.schema, match_keypoints(found, names, camera)[0]
     listed = ", ".join(map(str, candidates[:-1]))
     raise KroncError(f"no keypoints: expected {listed} or predictions in {candidates[-1]} ({FORMATS})")

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -45,8 +45,8 @@ class Frames:
     """``file_path`` of each: images/frame_00001.png."""
     source_names: tuple[str, ...]
     """What the source calls each of them; the same as `names` for a video."""
-    size: tuple[int, int]
-    """(width, height) of all of them."""
+    sizes: tuple[tuple[int, int], ...]
+    """(width, height) of each."""
     factors: tuple[int, ...]
     """Downscaled copies there are."""
     reused: bool
@@ -54,51 +54,60 @@ class Frames:
     note: str = ""
     """What of the source was left out and why."""
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of most of them."""
+        return usual_size(self.sizes)
 
-def check_source(source: Source, sampling: Sampling | None = None) -> tuple[int, int]:
-    """(width, height) of the upright frames, from the headers of images and the first frame of a video.
 
-    Raises `KroncError` unless there are at least 3 readable images of one size, or a readable video.
+def usual_size(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """The most frequent one."""
+    return Counter(sizes).most_common(1)[0][0]
+
+
+def check_source(source: Source, sampling: Sampling | None = None) -> tuple[tuple[int, int], ...]:
+    """(width, height) of the upright images from their headers, or of a video's frames (once) from the first of them.
+
+    Raises `KroncError` unless there are at least 3 readable images, or a readable video.
     """
     if source.kind == "video":
-        return probe_video(source.path, sampling or Sampling())
+        return (probe_video(source.path, sampling or Sampling()),)
     if len(source.images) < MIN_FRAMES:
         raise KroncError(
             f"{source.path} holds {len(source.images)} images: expected at least {MIN_FRAMES} views of the car"
         )
-    orient = source.camera is None
-    first = upright_size(source.images[0], orient)
-    for image in source.images[1:]:
-        size = upright_size(image, orient)
-        if size != first:
+    sizes = tuple(upright_size(image, orient=source.cameras is None) for image in source.images)
+    for image, size, camera in zip(source.images, sizes, source.cameras or (), strict=source.cameras is not None):
+        if size != (camera.width, camera.height):
             raise KroncError(
-                f"images of different sizes: {source.images[0]} is {_by(first)}, {image} is {_by(size)}: "
-                "expected one camera held one way; remove or crop those that differ"
+                f"{image} is {_by(size)}, {source.path / 'transforms.json'} says {camera.width}x{camera.height}: "
+                "expected intrinsics in the pixels of the images"
             )
-    if source.camera is not None and first != (source.camera.width, source.camera.height):
-        raise KroncError(
-            f"{source.images[0]} is {_by(first)}, {source.path / 'transforms.json'} says "
-            f"{source.camera.width}x{source.camera.height}: expected intrinsics in the pixels of the images"
-        )
-    return first
+    return sizes
 
 
-def plan_frames(source: Source, size: tuple[int, int], num_downscales: int = 3) -> Frames | None:
-    """What `prepare_frames` will make of images of ``size``; None for a video, whose frames are chosen on the way."""
+def plan_frames(source: Source, num_downscales: int = 3) -> Frames | None:
+    """What `prepare_frames` will make of images; None for a video, whose frames are chosen on the way."""
     if source.kind == "video":
         return None
-    factors = downscale_factors(size, num_downscales)
-    return Frames(frame_names(source.images), source.names, size, factors, reused=False, note=source.note)
+    sizes = tuple(upright_size(image, orient=source.cameras is None) for image in source.images)
+    factors = _common_factors(sizes, num_downscales)
+    return Frames(frame_names(source.images), source.names, sizes, factors, reused=False, note=source.note)
+
+
+def _common_factors(sizes: Sequence[tuple[int, int]], num_downscales: int) -> tuple[int, ...]:
+    """Copies that even the smallest image has: trainers take one level of all."""
+    return downscale_factors(min(sizes, key=min), num_downscales)
 
 
 def find_frames(source: Source, out: Path, sampling: Sampling | None = None, num_downscales: int = 3) -> Frames | None:
     """The frames that an earlier `prepare_frames` with the same arguments left in ``out``, if they are all there."""
     try:
         content = read_json(out / RECORD)
-        width, height = content["size"]
+        sizes = tuple((int(width), int(height)) for width, height in content["sizes"])
         names, factors = tuple(content["names"]), tuple(content["factors"])
         note, source_names = str(content["note"]), tuple(content["source_names"])
-        frames = Frames(names, source_names, (width, height), factors, reused=True, note=note)
+        frames = Frames(names, source_names, sizes, factors, reused=True, note=note)
         same = content["source"] == _signature(source, sampling or Sampling(), num_downscales)
     except (KroncError, KeyError, TypeError, ValueError):
         return None
@@ -133,19 +142,20 @@ def prepare_frames(
         source_names, note = names, video.note()
     else:
         names, source_names, note = frame_names(source.images), source.names, source.note
-        orient = source.camera is None
+        orient = source.cameras is None
+        own = _common_factors([upright_size(image, orient) for image in source.images], num_downscales)
 
         def copy(image: Path, name: str) -> None:
             whole = copy_upright(image, out / name, orient)
-            write_downscales(whole, out / name, downscale_factors(whole.size, num_downscales))
+            write_downscales(whole, out / name, own)
 
         pairs = list(zip(source.images, names, strict=True))
         _for_each(copy, pairs, lambda done: count(done, len(pairs), None))
-    size = upright_size(out / names[0], orient=False)
-    factors = downscale_factors(size, num_downscales)
-    content = {"source": signature, "size": size, "factors": factors, "names": names, "source_names": source_names}
+    sizes = tuple(upright_size(out / name, orient=False) for name in names)
+    factors = _common_factors(sizes, num_downscales)
+    content = {"source": signature, "sizes": sizes, "factors": factors, "names": names, "source_names": source_names}
     write_json(out / RECORD, {**content, "note": note})
-    return Frames(names, source_names, size, factors, reused=False, note=note)
+    return Frames(names, source_names, sizes, factors, reused=False, note=note)
 
 
 def frame_names(images: Sequence[Path]) -> tuple[str, ...]:
@@ -205,7 +215,7 @@ def _signature(source: Source, sampling: Sampling, num_downscales: int) -> str:
     states = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     names = source.names if source.kind == "scene folder" else None
     settings = {"photos": sampling.keep_duplicates, "video": asdict(sampling)}.get(source.kind)
-    text = json.dumps([states, names, source.camera is None, settings, num_downscales])
+    text = json.dumps([states, names, source.cameras is None, settings, num_downscales])
     return hashlib.sha256(text.encode()).hexdigest()
 
 

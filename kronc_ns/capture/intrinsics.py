@@ -29,6 +29,8 @@ class Intrinsics:
     """Where the focal length came from, in words."""
     assumed: bool = False
     """Nobody said it: it is the assumed field of view."""
+    cameras: tuple[Camera, ...] = ()
+    """Of each image, where they are by several cameras; `camera` is then that of most."""
 
 
 def find_intrinsics(
@@ -63,6 +65,62 @@ def find_intrinsics(
     focal = max(size) / 2 / math.tan(math.radians(fov_deg) / 2)
     reason = f" ({why_not})" if why_not else ""
     return Intrinsics(_centred(focal, size), f"assumed field of view of {fov_deg:g} deg{reason}", assumed=True)
+
+
+def find_all_intrinsics(
+    sizes: Sequence[tuple[int, int]],
+    photos: Sequence[Path] = (),
+    given: Sequence[Camera] | None = None,
+    focal_length_px: float | None = None,
+    fov_deg: float = 65.0,
+    given_by: str = "transforms.json",
+) -> Intrinsics:
+    """`find_intrinsics` of images of several ``sizes``, by several cameras or at several zoom settings.
+
+    Photos of one size whose EXIF agrees are by one camera; those that say nothing are by the one of their size, where
+    there is but one. With a single size for several ``photos`` (none, of a video) there is nothing to tell apart.
+    """
+    if len(sizes) != len(photos):
+        return find_intrinsics(sizes[0], photos, given[0] if given else None, focal_length_px, fov_deg, given_by)
+    focal = [None] * len(photos) if given or focal_length_px else [read_exif_focal(photo)[0] for photo in photos]
+    groups = _groups(sizes, [None if found is None else found.px for found in focal], given)
+    found: list[Intrinsics] = []
+    for group in groups:
+        first = group[0]
+        own = given[first] if given else None
+        its_photos = [photos[i] for i in group]
+        found.append(find_intrinsics(sizes[first], its_photos, own, focal_length_px, fov_deg, given_by))
+    if len(found) == 1:
+        return found[0]
+    cameras = {i: one.camera for group, one in zip(groups, found, strict=True) for i in group}
+    told = [f"{len(group)} images: {one.source}" for group, one in zip(groups, found, strict=True)]
+    largest = max(range(len(groups)), key=lambda k: len(groups[k]))
+    return Intrinsics(
+        found[largest].camera,
+        "; ".join(told),
+        any(one.assumed for one in found),
+        tuple(cameras[i] for i in range(len(photos))),
+    )
+
+
+def _groups(
+    sizes: Sequence[tuple[int, int]], focal_px: Sequence[float | None], given: Sequence[Camera] | None
+) -> list[list[int]]:
+    """Indices of the images of each camera."""
+    groups: dict[object, list[int]] = {}
+    if given:
+        for i, camera in enumerate(given):
+            groups.setdefault(camera, []).append(i)
+        return [*groups.values()]
+    shortest: dict[tuple[int, int], list[float]] = {size: [] for size in sizes}
+    for size, px in sorted((size, px) for size, px in zip(sizes, focal_px, strict=True) if px is not None):
+        if not shortest[size] or px > shortest[size][-1] * (1 + _SAME_FOCAL):
+            shortest[size].append(px)
+    for i, (size, px) in enumerate(zip(sizes, focal_px, strict=True)):
+        zooms = shortest[size]
+        zoom = len(zooms) if px is None else sum(px >= least for least in zooms) - 1
+        groups.setdefault((size, 0 if px is None and len(zooms) == 1 else zoom), []).append(i)
+    return [*groups.values()]
 
 
 def read_calibration(file: Path, size: tuple[int, int]) -> Camera:

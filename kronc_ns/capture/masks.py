@@ -28,8 +28,9 @@ def check_masks(masks: Path | tuple[Path, ...], frames: Frames | None, size: tup
         files = masks
     else:
         files = _masks_of_video(masks) if frames is None else find_masks(masks, frames)
-    for file in dict.fromkeys(files):
-        read_mask(file, size)
+    sizes = [size] * len(files) if frames is None else frames.sizes
+    for file, own in dict.fromkeys(zip(files, sizes, strict=True)):
+        read_mask(file, own)
 
 
 def find_masks(masks: Path | tuple[Path, ...], frames: Frames) -> tuple[Path, ...]:
@@ -95,8 +96,8 @@ def _possible_names(frames: Frames) -> list[list[str]]:
 def write_masks(files: Sequence[Path], frames: Frames, out: Path) -> tuple[str, ...]:
     """Write ``files`` as masks of ``frames`` with all downscaled copies; their new paths."""
     names = tuple(f"masks/{_stem(name)}.png" for name in frames.names)
-    for file, name in zip(files, names, strict=True):
-        mask = read_mask(file, frames.size)
+    for file, name, size in zip(files, names, frames.sizes, strict=True):
+        mask = read_mask(file, size)
         for factor in (1, *frames.factors):
             path = level_path(out / name, factor)
             path.parent.mkdir(exist_ok=True)

@@ -11,7 +11,7 @@ from kronc_ns.capture.images import HEIF_SUFFIXES, read_heif
 from kronc_ns.capture.photos import PHOTO_SUFFIXES, find_photos, relative_names, told_of
 from kronc_ns.errors import KroncError
 from kronc_ns.files.output import read_json
-from kronc_ns.files.transforms import camera_and_frames, read_poses
+from kronc_ns.files.transforms import cameras_and_frames, read_poses
 from kronc_ns.geometry.camera import Camera
 
 MIN_FRAMES = 3
@@ -28,8 +28,8 @@ class Source:
     """Image files in capture order; empty for a video, whose frames have to be extracted."""
     names: tuple[str, ...]
     """What keypoint files may call the images."""
-    camera: Camera | None = None
-    """Intrinsics of transforms.json."""
+    cameras: tuple[Camera, ...] | None = None
+    """Intrinsics of each image, as transforms.json has them."""
     c2w: Float[np.ndarray, "n 3 4"] | None = None
     """Poses of transforms.json (OpenCV axes), where every frame has one."""
     masks: Path | tuple[Path, ...] | None = None
@@ -85,7 +85,7 @@ def _photos(data: Path) -> Source:
 
 def _scene(data: Path) -> Source:
     file = data / "transforms.json"
-    camera, frames = camera_and_frames(read_json(file), file)
+    cameras, frames = cameras_and_frames(read_json(file), file)
     names = tuple(str(frame["file_path"]) for frame in frames)
     images = tuple(data / name for name in names)
     missing = [image for image in images if not image.is_file()]
@@ -102,7 +102,7 @@ def _scene(data: Path) -> Source:
         "scene folder",
         images,
         names,
-        camera=camera,
+        cameras=tuple(cameras),
         c2w=np.stack([poses[name] for name in names]) if posed else None,
         masks=masks or (data / "masks" if (data / "masks").is_dir() else None),
         depths=_listed(data, frames, "depth_file_path"),

@@ -56,7 +56,7 @@ class Detect:
             status = self._detect(detector, [out / name for name in frames.names], frames.names)
         else:
             with TemporaryDirectory(prefix="kronc-detect-") as folder:
-                orient = source.camera is None  # else transforms.json speaks of the pixels as stored
+                orient = source.cameras is None  # else transforms.json speaks of the pixels as stored
                 images = _upright(source.images, Path(folder)) if orient else source.images
                 status = self._detect(detector, images, source.names)
         release_output(out)

@@ -17,8 +17,11 @@ class Solve(SolverOptions):
     """New or empty folder, or one with an earlier result; gets transforms.json, kronc.json and keypoints.ply. Of
     several scenes each gets a folder of its name in it."""
     keypoints: Path | None = None
-    """Keypoints from elsewhere (of a single scene): our keypoints.json, a folder of OpenPifPaf *.predictions.json, or
-    COCO JSON."""
+    """Keypoints from elsewhere (of a single scene): our keypoints.json, COCO, OpenPifPaf, MMPose, Ultralytics or Label
+    Studio (docs/keypoints.md)."""
+    keypoint_names: str | None = None
+    """Which points they are, where their file does not say: apollocar3d-66, openpifpaf-24, or a file with a name a
+    line."""
     depth_weights: Path | None = None
     """For --depth-init prior without depth maps: folder or Hugging Face name of a DINOv2 model with a DPT head (default
     facebook/dpt-dinov2-base-kitti, downloaded)."""
@@ -39,10 +42,11 @@ class Solve(SolverOptions):
         config = self.solver_config()
         folders = expand(self.data)
         if len(folders) > 1:
-            if self.keypoints is not None:
-                raise KroncError(f"--keypoints {self.keypoints} with {len(folders)} scenes: expected a single scene")
+            for option, value in (("keypoints", self.keypoints), ("keypoint-names", self.keypoint_names)):
+                if value is not None:
+                    raise KroncError(f"--{option} {value} with {len(folders)} scenes: expected a single scene")
             return solve_folders(folders, self.output_dir, config, self.depth_weights)
-        scene = load_scene(folders[0], self.keypoints)
+        scene = load_scene(folders[0], self.keypoints, self.keypoint_names)
         if self.output_dir.resolve() == folders[0].resolve():
             raise KroncError(f"--output-dir {self.output_dir} is the scene itself: choose another folder")
         with progress_bar("estimating depths") as progress:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from kronc_ns.errors import KroncError
 from kronc_ns.files.images import depth_under, read_depth
-from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints, sigma_of
+from kronc_ns.files.keypoints import Detections, match_keypoints, read_keypoints, sigma_of, under_file_names
 from kronc_ns.files.output import read_json
 from kronc_ns.files.record import left_out_views
 from kronc_ns.files.transforms import cameras_and_frames, given_poses
@@ -19,9 +19,10 @@ from kronc_ns.scene import Scene
 _UNDONE_PX, _FEW = 0.5, 0.05
 
 
-def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
+def load_scene(folder: Path | str, keypoints: Path | None = None, keypoint_names: str | None = None) -> Scene:
     """Read a scene folder: ``transforms.json`` (intrinsics, frames) and ``keypoints.json`` (or ``keypoints``).
 
+    ``keypoint_names`` says which points they are where their file does not (a known schema, or a file of names).
     Raises `KroncError` naming the file and the remedy for anything that is missing, malformed or inconsistent.
     """
     folder = Path(folder)
@@ -43,15 +44,18 @@ def load_scene(folder: Path | str, keypoints: Path | None = None) -> Scene:
     if any(masks) and not all(masks):
         raise KroncError(f"{file}: frame {names[masks.index('')]} lacks a mask_path that others have: give all or none")
     is_solution = (folder / "kronc.json").exists()
-    found = read_keypoints(keypoints or folder)
+    found = read_keypoints(keypoints or folder, keypoint_names)
     if is_solution:
-        found = _without(found, left_out_views(folder))
+        left_out = left_out_views(folder)
+        found = _without(under_file_names(found, (*names, *left_out)), left_out)
     if lenses is not None and found.size is not None and any((c.width, c.height) != found.size for c in cameras):
         raise KroncError(
             f"{found.source} is for images of {found.size[0]}x{found.size[1]}, {file} has images of several sizes: "
             "expected keypoints in the pixels of each image, and no width and height for all"
         )
-    rows, note = match_keypoints(found, names, camera, [folder / m for m in masks] if all(masks) and masks else None)
+    mask_files = [folder / mask for mask in masks] if all(masks) and masks else None
+    sizes = [(one.width, one.height) for one in cameras]
+    rows, note = match_keypoints(found, names, camera, mask_files, sizes)
     for own in set(cameras):
         _check_distortion(own, rows[[one == own for one in cameras]], file)
     return Scene(

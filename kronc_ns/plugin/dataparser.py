@@ -48,7 +48,11 @@ class KroncDataParserConfig(SolverOptions, DataParserConfig):
     """Scene folder; it is only read. What `ns-process-data kronc` wrote is used as solved unless a solver option or
     keypoints are given."""
     keypoints: Path | None = None
-    """Keypoints from elsewhere: our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON."""
+    """Keypoints from elsewhere: our keypoints.json, COCO, OpenPifPaf, MMPose, Ultralytics or Label Studio
+    (docs/keypoints.md)."""
+    keypoint_names: str | None = None
+    """Which points they are, where their file does not say: apollocar3d-66, openpifpaf-24, or a file with a name a
+    line."""
     background: Literal["white", "mask", "keep"] = "white"
     """white: train on the vehicle alone, cut out by the masks or the images' alpha; mask: ignore what the masks
     leave out; keep: train on the full frame."""
@@ -91,10 +95,11 @@ class KroncDataParser(DataParser):
     def _solve(self) -> tuple[Scene, Solution]:
         """The scene, and its solution: that of a solved folder, else from the cache, else solved now."""
         config = self.config
-        scene = load_scene(config.data, config.keypoints)
+        scene = load_scene(config.data, config.keypoints, config.keypoint_names)
         check_file_names(scene.names, config.data / "transforms.json")
         folder = config.data
-        if not (folder / "kronc.json").exists() or config.keypoints is not None or config.any_solver_option():
+        own_keypoints = config.keypoints is not None or config.keypoint_names is not None
+        if not (folder / "kronc.json").exists() or own_keypoints or config.any_solver_option():
             with solving("solving poses") as progress:
                 folder = solve_cached(config.data, scene, config.solver_config(), progress)
         record = read_record(folder)
@@ -174,6 +179,7 @@ def _cameras(c2w: Float[np.ndarray, "n 3 4"], of_views: Sequence[Camera], level:
         height=sizes[:, 1],
         distortion_params=torch.tensor([[c.k1, c.k2, 0.0, 0.0, c.p1, c.p2] for c in of_views]),
         camera_type=CameraType.PERSPECTIVE,
+        metadata={},  # where `ns-export cameras` notes which camera of a refined run it is
     )
     cameras.rescale_output_resolution(scaling_factor=1.0 / level)
     return cameras

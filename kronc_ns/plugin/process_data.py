@@ -1,6 +1,7 @@
 """`ns-process-data kronc` and its twin `kronc-process-data`: video or photos to a dataset with solved poses."""
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,8 +17,8 @@ from kronc_ns.capture.detection.detector import Detector
 from kronc_ns.capture.detection.finding import find_keypoints
 from kronc_ns.capture.detection.guided import GuidedDetector, second_look
 from kronc_ns.capture.duplicates import without_duplicates
-from kronc_ns.capture.frames import Frames, check_source, find_frames, plan_frames, prepare_frames
-from kronc_ns.capture.intrinsics import Intrinsics, find_intrinsics, read_calibration
+from kronc_ns.capture.frames import Frames, check_source, find_frames, plan_frames, prepare_frames, usual_size
+from kronc_ns.capture.intrinsics import Intrinsics, find_all_intrinsics, read_calibration
 from kronc_ns.capture.masks import check_masks, find_masks, write_masks
 from kronc_ns.capture.matching import Matched, match_frames
 from kronc_ns.capture.segmentation.choice import SegmenterOptions, segment_car
@@ -37,6 +38,7 @@ from kronc_ns.files.transforms import transforms_dict
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.fit.starts import MIN_POINTS
+from kronc_ns.geometry.camera import Camera, Lenses
 from kronc_ns.scene import Scene
 from kronc_ns.show.report import write_report
 from kronc_ns.solution import Solution, Status
@@ -54,7 +56,11 @@ class KroncToNerfstudio:
     output_dir: Path
     """New or empty folder, or one that this command wrote; gets nerfstudio's layout and kronc.json."""
     keypoints: Path | None = None
-    """Our keypoints.json, a folder of OpenPifPaf *.predictions.json, or COCO JSON. Default: those in DATA, if any."""
+    """Our keypoints.json, COCO, OpenPifPaf, MMPose, Ultralytics or Label Studio (docs/keypoints.md). Default: those in
+    DATA, if any."""
+    keypoint_names: str | None = None
+    """Which points they are, where their file does not say: apollocar3d-66, openpifpaf-24, or a file with a name a
+    line."""
     detection: Annotated[DetectorOptions, tyro.conf.arg(name="")] = field(default_factory=DetectorOptions)
     """How keypoints are found, where no file holds them."""
     masks: Path | None = None
@@ -102,14 +108,16 @@ class KroncToNerfstudio:
                 f"--init given: {self.data} has no transforms.json with a pose for every frame: use --init auto"
             )
         detector = self.detection.make(default="builtin" if given is None else "none")
+        if detector is not None and self.keypoint_names is not None:
+            raise KroncError(f"--keypoint-names {self.keypoint_names}: expected --keypoints, whose points they name")
         segmenter = self.segmentation.make()
         if source.depths is None:
             depth_estimator(config, self.depth_weights)
         sampling = Sampling(self.num_frames, self.fps, self.keep_duplicates)
-        size = check_source(source, sampling)
+        sizes = check_source(source, sampling)
         check_sidecars(source)
         found = None if detector else self._read_keypoints(source, given)
-        intrinsics = self._intrinsics(source, size)
+        intrinsics = self._intrinsics(source, sizes)
         every_name = source.names
         frames = find_frames(source, out, sampling, self.num_downscales)
         if frames is None and self.keypoints is not None and self.keypoints.resolve().is_relative_to(out.resolve()):
@@ -119,11 +127,11 @@ class KroncToNerfstudio:
             )
         if frames is None and not self.keep_duplicates:
             with progress_bar("comparing photos") as progress:
-                source = without_duplicates(source, size, progress)
-        planned = frames or plan_frames(source, size, self.num_downscales)
+                source = without_duplicates(source, usual_size(sizes), progress)
+        planned = frames or plan_frames(source, self.num_downscales)
         given_masks = None if segmenter else self.masks or source.masks
         if given_masks is not None:
-            check_masks(given_masks, planned, size)
+            check_masks(given_masks, planned, usual_size(sizes))
         if found is not None and planned is not None:
             match_frames(found, every_name, planned, intrinsics.camera)
         claim_output(out, "data set")
@@ -134,10 +142,13 @@ class KroncToNerfstudio:
         if intrinsics.assumed:
             print(_assumption(intrinsics), file=sys.stderr)
         masks, mask_note = self._write_masks(segmenter, given_masks, frames)
-        transforms = transforms_dict(
-            intrinsics.camera, frames.names, source.c2w, masks, copy_depths(source, frames, out)
+        own = dict(zip(every_name, intrinsics.cameras, strict=True)) if intrinsics.cameras else {}
+        lenses = Lenses.of([own[name] for name in frames.source_names]) if own else None
+        camera = intrinsics.camera if lenses is None else lenses.usual
+        depths = copy_depths(source, frames, out)
+        write_json(
+            out / "transforms.json", transforms_dict(camera, frames.names, source.c2w, masks, depths, lenses=lenses)
         )
-        write_json(out / "transforms.json", transforms)
         copy_reference(source, frames, out)
         if detector is not None:
             found = _detect(detector, frames, masks, out)
@@ -163,14 +174,15 @@ class KroncToNerfstudio:
         levels = "".join(f", 1/{factor}" for factor in frames.factors)
         origin = "as an earlier run left them" if frames.reused else f"from {source.kind} {self.data}"
         left_out = f"; {frames.note}" if frames.note else ""
-        table.add_row("frames", f"{len(frames.names)} of {frames.size[0]}x{frames.size[1]}{levels}, {origin}{left_out}")
+        measures = " and ".join(f"{width}x{height}" for width, height in dict.fromkeys(frames.sizes))
+        table.add_row("frames", f"{len(frames.names)} of {measures}{levels}, {origin}{left_out}")
         if mask_note:
             table.add_row("masks", mask_note)
         table.add_row("keypoints", _seen(scene))
         if again:
             table.add_row("second look", again)
-        refined = f", refined to {solution.camera.fx:.1f} px" if config.refine_focal else ""
-        table.add_row("focal length", f"{intrinsics.camera.fx:.1f} px: {intrinsics.source}{refined}")
+        refined = f", refined to {_focal(solution.camera, solution.lenses)}" if config.refine_focal else ""
+        table.add_row("focal length", f"{_focal(camera, lenses)}: {intrinsics.source}{refined}")
         table.add_row("report", str(write_report(out)))
         Console().print(table)
         status = exit_status(report)
@@ -198,7 +210,7 @@ class KroncToNerfstudio:
     def _read_keypoints(self, source: Source, given: Path | None) -> Detections | None:
         """Detections of a file, or None where frames alone are wanted."""
         if given is not None:
-            return read_keypoints(given)
+            return read_keypoints(given, self.keypoint_names)
         if source.kind == "scene folder":
             raise KroncError(
                 f"{self.data} has no keypoints.json: give --keypoints ({FORMATS}), or find them with --detector builtin"
@@ -210,11 +222,11 @@ class KroncToNerfstudio:
             )
         return None
 
-    def _intrinsics(self, source: Source, size: tuple[int, int]) -> Intrinsics:
-        given, given_by = source.camera, "transforms.json"
+    def _intrinsics(self, source: Source, sizes: Sequence[tuple[int, int]]) -> Intrinsics:
+        given, given_by = source.cameras, "transforms.json"
         if self.camera is not None:
-            given, given_by = read_calibration(self.camera, size), str(self.camera)
-        return find_intrinsics(size, source.images, given, self.focal_length_px, self.fov_deg, given_by)
+            given, given_by = tuple(read_calibration(self.camera, size) for size in sizes), str(self.camera)
+        return find_all_intrinsics(sizes, source.images, given, self.focal_length_px, self.fov_deg, given_by)
 
     def _write_masks(
         self, segmenter: Segmenter | None, given: Path | tuple[Path, ...] | None, frames: Frames
@@ -241,7 +253,7 @@ def main() -> None:
 
 def _detect(detector: Detector, frames: Frames, masks: tuple[str, ...] | None, out: Path) -> Detections:
     with progress_bar("detecting") as progress:
-        return find_keypoints(detector, out, frames.names, frames.size, masks, progress)
+        return find_keypoints(detector, out, frames.names, frames.sizes, masks, progress)
 
 
 def _look_again(
@@ -252,7 +264,7 @@ def _look_again(
         looked, solution, note = second_look(detector, out, scene, solution, config, progress)
     if looked is not scene:
         rows = dict(zip(looked.names, looked.keypoints, strict=True))
-        size = (scene.camera.width, scene.camera.height)
+        size = None if scene.lenses else (scene.camera.width, scene.camera.height)
         write_keypoints(out / "keypoints.json", looked.schema, size, rows, looked.sigma_px)
     return looked, solution, note
 
@@ -271,10 +283,15 @@ def _write_keypoints(matched: Matched, frames: Frames, out: Path) -> str:
     target = out / "keypoints.json"
     if matched.source.resolve() == target.resolve():
         return ""
-    write_keypoints(
-        target, matched.schema, frames.size, dict(zip(frames.names, matched.rows, strict=True)), matched.sigma_px
-    )
+    size = frames.size if len({*frames.sizes}) == 1 else None
+    write_keypoints(target, matched.schema, size, dict(zip(frames.names, matched.rows, strict=True)), matched.sigma_px)
     return matched.note
+
+
+def _focal(camera: Camera, lenses: Lenses | None) -> str:
+    """Focal lengths in words."""
+    cameras = (camera,) if lenses is None else lenses.cameras
+    return f"{', '.join(f'{one.fx:.1f}' for one in cameras)} px"
 
 
 def _assumption(intrinsics: Intrinsics) -> str:

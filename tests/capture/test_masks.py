@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kronc_ns.capture.frames import Frames, check_source, plan_frames, prepare_frames
+from kronc_ns.capture.frames import Frames, plan_frames, prepare_frames
 from kronc_ns.capture.masks import check_masks, find_masks, write_masks
 from kronc_ns.capture.source import find_source
 from kronc_ns.errors import KroncError
@@ -142,7 +142,7 @@ def test_masks_that_do_not_fit_are_named_from_the_plan(tmp_path: Path):
         photo(tmp_path / "photos" / f"IMG_{i}.png", i)
         mask(tmp_path / "masks" / f"IMG_{i}.png", 10, SIZE if i < 2 else SIZE[::-1])
     source = find_source(tmp_path / "photos")
-    planned = plan_frames(source, check_source(source))
+    planned = plan_frames(source)
     assert planned is not None
     with pytest.raises(KroncError, match=r"IMG_2\.png is 202x240, its image 240x202: expected masks in the pixels"):
         check_masks(tmp_path / "masks", planned, planned.size)

@@ -55,7 +55,7 @@ def clip(path: Path) -> Path:
 
 def looked_at(folder: Path) -> Source:
     source = find_source(folder)
-    return without_duplicates(source, check_source(source))
+    return without_duplicates(source, check_source(source)[0])
 
 
 def test_of_live_photos_the_photos_are_taken_and_that_is_said(tmp_path: Path):

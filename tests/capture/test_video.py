@@ -203,7 +203,7 @@ def test_a_phones_video_is_upright_in_its_colours_and_spread_over_time(tmp_path:
     with av.open(str(phone)) as container:
         assert container.streams[0].type == "audio"
         assert container.streams.video[0].codec_context.pix_fmt == "yuv420p10le"
-    assert check_source(find_source(phone)) == (HEIGHT, WIDTH)
+    assert set(check_source(find_source(phone))) == {(HEIGHT, WIDTH)}
 
     quarter = (
         1
@@ -228,9 +228,9 @@ def test_a_phones_video_is_upright_in_its_colours_and_spread_over_time(tmp_path:
 
 def test_the_size_of_a_video_is_known_before_its_frames(tmp_path: Path):
     video = film(tmp_path / "walk.mp4", [view(20.0 * i) for i in range(60)])
-    assert check_source(find_source(video)) == (WIDTH, HEIGHT)
-    assert check_source(find_source(turn(video, tmp_path / "turned.mp4", 90))) == (HEIGHT, WIDTH)
-    assert check_source(find_source(turn(video, tmp_path / "head.mp4", 180))) == (WIDTH, HEIGHT)
+    assert set(check_source(find_source(video))) == {(WIDTH, HEIGHT)}
+    assert set(check_source(find_source(turn(video, tmp_path / "turned.mp4", 90)))) == {(HEIGHT, WIDTH)}
+    assert set(check_source(find_source(turn(video, tmp_path / "head.mp4", 180)))) == {(WIDTH, HEIGHT)}
 
 
 def test_a_rate_that_gives_too_few_frames_is_named_at_once(tmp_path: Path):

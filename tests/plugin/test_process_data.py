@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from kronc_ns.capture.detection.builtin import detector as builtin
 from kronc_ns.capture.detection.choice import DetectorOptions
@@ -20,7 +20,9 @@ from kronc_ns.commands.options import SolverOptions
 from kronc_ns.files.keypoints import read_keypoints
 from kronc_ns.files.output import MARKER
 from kronc_ns.files.scene_folder import load_scene
-from kronc_ns.files.transforms import read_poses
+from kronc_ns.files.transforms import read_poses, transforms_dict
+from kronc_ns.geometry.camera import Camera, Lenses
+from kronc_ns.keypoints.schema import APOLLOCAR3D_66
 from kronc_ns.metrics.poses import evaluate_poses
 from kronc_ns.plugin import process_data
 from kronc_ns.plugin.process_data import KroncToNerfstudio
@@ -91,6 +93,54 @@ def _write_openpifpaf(folder: Path, capture: Capture, names: list[str]) -> None:
         shifted = np.where(rows[:, 2:] > 0, rows - [0.5, 0.5, 0.0], 0.0)
         text = json.dumps([{"keypoints": shifted.flatten().tolist()}])
         (folder / f"{name}.predictions.json").write_text(text)
+
+
+def test_photos_of_two_phones_keep_their_own_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Every third photo by another phone, upright and of another focal length; EXIF tells both."""
+    phones = default_camera("walk"), Camera(450.0, 450.0, 150.0, 200.0, 300, 400)
+    captures = [make_capture("walk", views=20, seed=3, noise_px=0.5, camera=phone) for phone in phones]
+    data, frames = tmp_path / "photos", []
+    for i in range(20):
+        of = int(i % 3 == 1)
+        exif = Image.Exif()
+        diagonal = np.hypot(phones[of].width, phones[of].height)
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = round(phones[of].fx / diagonal * 43.27)
+        _picture(data / f"{i:02d}.jpg", i)
+        picture = Image.open(data / f"{i:02d}.jpg").resize((phones[of].width, phones[of].height))
+        picture.save(data / f"{i:02d}.jpg", exif=exif)
+        frames.append({"file_path": f"{i:02d}.jpg", "keypoints": captures[of].keypoints[i].tolist()})
+    (data / "keypoints.json").write_text(json.dumps({"schema": "apollocar3d-66", "frames": frames}))
+    out = tmp_path / "out"
+    assert _status(KroncToNerfstudio(data=data, output_dir=out, solve=SolverOptions(refine_focal=True))) == 0
+    printed = capsys.readouterr().out
+    assert "480x270 and 300x400" in printed
+    content = json.loads((out / "transforms.json").read_text())
+    assert "fl_x" not in content
+    focal = {(frame["w"], frame["h"]): frame["fl_x"] for frame in content["frames"]}
+    assert focal[480, 270] == pytest.approx(400, rel=0.02)
+    assert focal[300, 400] == pytest.approx(450, rel=0.02)
+    truth = {f"images/frame_{i + 1:05d}.jpg": pose for i, pose in enumerate(captures[0].c2w)}
+    assert evaluate_poses(read_poses(out / "transforms.json"), truth).as_dict()["rotation_deg"]["mean"] < 1.0
+    assert "480 × 270, 300 × 400" in (out / "report.html").read_text()
+
+
+@pytest.mark.nerfstudio
+def test_nerfstudio_reads_a_data_set_of_two_phones(tmp_path: Path):
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    phones = default_camera("walk"), Camera(450.0, 450.0, 150.0, 200.0, 300, 400)
+    lenses = Lenses.of([phones[i % 2] for i in range(6)])
+    capture, names = make_capture("walk", views=6, seed=3), [f"images/{i}.png" for i in range(6)]
+    for name, phone in zip(names, lenses.each, strict=True):
+        _picture(tmp_path / name, 0)
+        Image.new("RGB", (phone.width, phone.height)).save(tmp_path / name)
+    (tmp_path / "transforms.json").write_text(
+        json.dumps(transforms_dict(lenses.usual, names, capture.c2w, lenses=lenses))
+    )
+    parser = NerfstudioDataParserConfig(data=tmp_path, downscale_factor=1, eval_mode="all").setup()
+    cameras = parser.get_dataparser_outputs("train").cameras
+    assert cameras.width.flatten().tolist() == [480, 300] * 3
+    assert cameras.fx.flatten().tolist() == [400, 450] * 3
 
 
 def test_scene_folder_to_dataset(scene: Path, tmp_path: Path, capture: Capture, capsys: pytest.CaptureFixture[str]):
@@ -212,6 +262,27 @@ def test_keypoints_may_use_the_names_of_the_photos(
     assert _status(command) == 0
     assert np.abs(load_scene(out).keypoints - capture.keypoints).max() < 2e-3
     assert load_scene(out).masks is not None
+
+
+def test_labels_of_another_tool_by_the_stems_of_the_photos(
+    scene: Path, tmp_path: Path, config: SolverOptions, capture: Capture, capsys: pytest.CaptureFixture[str]
+):
+    labels, names = tmp_path / "labels", tmp_path / "names.txt"
+    labels.mkdir()
+    names.write_text("\n".join(APOLLOCAR3D_66.keypoints))
+    for i, rows in enumerate(capture.keypoints, start=1):
+        shares = np.where(rows[:, 2:] > 0, rows / [480, 270, 1], 0)
+        words = [f"{value:.9f}" for value in shares.ravel()]
+        words[int(np.flatnonzero(rows[:, 2])[0]) * 3] = "nan"
+        (labels / f"IMG_{i}.txt").write_text(f"0 .5 .5 .5 .5 {' '.join(words)}")
+    options = {"data": scene / "images", "output_dir": tmp_path / "out", "keypoint_names": str(names), "solve": config}
+    assert _status(KroncToNerfstudio(**options)) == 2
+    assert "names.txt: expected --keypoints, whose points they name" in capsys.readouterr().err
+    assert _status(KroncToNerfstudio(keypoints=labels, focal_length_px=400.0, **options)) == 0
+    assert "finite" in capsys.readouterr().out
+    found, seen = load_scene(tmp_path / "out"), capture.keypoints[..., 2] > 0
+    assert seen.sum() - found.seen.sum() == VIEWS
+    assert np.abs(found.uv - capture.keypoints[..., :2])[found.seen].max() < 2e-3
 
 
 def test_a_calibration_goes_through_to_the_dataset(scene: Path, tmp_path: Path, config: SolverOptions):

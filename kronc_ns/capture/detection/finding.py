@@ -23,14 +23,14 @@ def find_keypoints(
     detector: Detector,
     folder: Path,
     names: Sequence[str],
-    size: tuple[int, int],
+    sizes: Sequence[tuple[int, int]],
     masks: Sequence[str] | None = None,
     progress: Count | None = None,
 ) -> Detections:
-    """All cars in the images ``names`` (and ``masks``) of ``folder``, whose (width, height) is ``size``."""
+    """All cars in the images ``names`` (and ``masks``) of ``folder``, whose (width, height) are ``sizes``."""
     paths = [folder / mask for mask in masks] if masks else [None] * len(names)
     images = [CarImage(folder / name, mask) for name, mask in zip(names, paths, strict=True)]
-    found = find_cars(detector, images, names, [size] * len(names), folder, progress)
+    found = find_cars(detector, images, names, sizes, folder, progress)
     if not any(len(rows) for rows in found.frames.values()):
         raise KroncError(no_car(detector, len(names), folder) + ", or give --keypoints")
     return found

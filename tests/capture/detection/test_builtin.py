@@ -191,7 +191,7 @@ def test_what_is_turned_without_saying_so_is_told(detector: BuiltinDetector, tmp
         assert not only.confidence.any()
         assert only.turned_deg == 360 - 90 * quarters
         with pytest.raises(KroncError, match=f"in 1 of 1 images of .* the car .*: turn the photos by {remedy}"):
-            find_keypoints(detector, tmp_path, ["images/a.png"], turned.shape[1::-1])
+            find_keypoints(detector, tmp_path, ["images/a.png"], [turned.shape[1::-1]])
 
 
 @pytest.mark.parametrize("kind", ["transparent", "palette", "jpeg"])

@@ -119,7 +119,7 @@ def test_all_that_a_detector_says_is_kept(tmp_path: Path):
     assert first.sigma_px is not None
     assert first.sigma_px.tolist() == [1.5, 0.0, 2.0, 3.0]
     assert (first.turned_deg, second.turned_deg) == (0, 90)
-    frames = find_keypoints(Sure(), tmp_path, ["images/0.png", "images/1.png"], SIZE)
+    frames = find_keypoints(Sure(), tmp_path, ["images/0.png", "images/1.png"], [SIZE] * 2)
     assert frames.sigma_px is not None
     assert frames.sigma_px["images/0.png"].tolist() == [[1.5, 0.0, 0.0, 0.0]]
     assert frames.frames["images/1.png"].shape == (0, 4, 3)
@@ -138,7 +138,7 @@ def test_damaged_entries_are_made_anew(tmp_path: Path):
 
 def test_points_outside_the_image_are_left_out(tmp_path: Path):
     images_of(tmp_path, [1, 0])
-    found = find_keypoints(Counting(), tmp_path, ["images/0.png", "images/1.png"], SIZE)
+    found = find_keypoints(Counting(), tmp_path, ["images/0.png", "images/1.png"], [SIZE] * 2)
     rows = found.frames["images/0.png"]
     np.testing.assert_array_equal(rows, [[[1, 1, 0.9], [0, 0, 0], [0, 0, 0], [0, 0, 0]]])
     assert found.frames["images/1.png"].shape == (0, 4, 3)
@@ -148,4 +148,4 @@ def test_points_outside_the_image_are_left_out(tmp_path: Path):
 def test_no_car_anywhere_is_an_error(tmp_path: Path):
     images_of(tmp_path, [0, 0])
     with pytest.raises(KroncError, match="no car was found in any of the 2 images"):
-        find_keypoints(Counting(), tmp_path, ["images/0.png", "images/1.png"], SIZE)
+        find_keypoints(Counting(), tmp_path, ["images/0.png", "images/1.png"], [SIZE] * 2)
