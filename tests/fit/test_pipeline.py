@@ -28,7 +28,8 @@ from tests.fit.common import PLAIN, assert_stands_as, length_m, without_overlap
 
 def assert_recovered(solution: Solution, capture: Capture, degrees: float = 1.0) -> None:
     assert solution.status is Status.CONVERGED, solution.reason
-    assert solution.views_that_are(ViewStatus.SOLVED).all()
+    assert solution.posed.all()
+    assert solution.views_that_are(ViewStatus.SOLVED).mean() >= 0.95
     assert pose_errors(solution.c2w, capture.c2w)[0].mean() < degrees
 
 

@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from kronc_ns.errors import KroncError
 from kronc_ns.keypoints.schema import APOLLOCAR3D_66
-from kronc_ns.training.bodies import WITH_KEYPOINTS, draw_body, load_garage
+from kronc_ns.training.bodies import KEPT_OUT, WITH_KEYPOINTS, draw_body, load_garage
 from kronc_ns.training.body import Body
 from kronc_ns.training.decals import painted
 from kronc_ns.training.deformation import Proportions, deform, refined
@@ -156,7 +156,10 @@ def test_a_garage_without_cars_says_so(tmp_path):
 def test_bodies_from_the_garage_keep_their_points():
     garage = load_garage(SHARED_DATA / "cars_train", SHARED_DATA / "cars")
     names = {model.body.name for model in garage}
-    assert set(WITH_KEYPOINTS) <= names
+    assert set(WITH_KEYPOINTS) - set(KEPT_OUT) <= names
+    assert not names & set(KEPT_OUT)
+    kept_out = load_garage(SHARED_DATA / "cars_train", SHARED_DATA / "cars", kept_out=True)
+    assert {model.body.name for model in kept_out} == set(KEPT_OUT)
     assert not names & {"porsche_911", "md_dino246"}
     rng = np.random.default_rng(1)
     for _ in range(4):
