@@ -177,7 +177,9 @@ def test_too_few_usable_views_are_written_but_not_trusted(kronc, scene, edit, tm
     for part in ("only 2 views", "template", "2 of 12 views"):
         assert part in result.err
     report = json.loads((tmp_path / "out/kronc.json").read_text())
-    assert [view["status"] for view in report["views"]] == ["completed"] * 2 + ["failed"] * 10
+    statuses = [view["status"] for view in report["views"]]
+    assert set(statuses[:2]) <= {"solved", "completed"}, "as well as the template alone tells"
+    assert statuses[2:] == ["failed"] * 10
     assert len(read_poses(tmp_path / "out/transforms.json")) == 2
 
 

@@ -101,15 +101,15 @@ def test_where_all_is_solved_or_nothing_nothing_is_placed(scene, solution):
 def test_a_vague_view_keeps_its_own_pose_where_the_walk_does_not_tell_it_better(scene, solution):
     """Of two vague views one is surer than the walk between its neighbours, the other is not."""
     evidence = evidence_of(solution)
-    rotation = evidence.sigma_rot_deg.copy()
-    rotation[[5, 12]] = 2.5, 90.0
-    vague = replace(evidence, sigma_rot_deg=rotation)
+    rotation, centre = evidence.sigma_rot_deg.copy(), evidence.sigma_trans_m.copy()
+    centre[5], rotation[12] = 0.4, 90.0
+    vague = replace(evidence, sigma_rot_deg=rotation, sigma_trans_m=centre)
     verdict = judge(scene, vague)
     c2w, views = complete(scene, vague, verdict)
     assert [i for i, view in enumerate(views) if view.status is ViewStatus.COMPLETED] == [5, 12]
     assert_array_equal(c2w[5], solution.c2w[5])
-    assert views[5].sigma_rot_deg == pytest.approx(2.5)
-    assert "standard deviation 2.5 deg" in views[5].reason
+    assert views[5].sigma_trans_m == pytest.approx(0.4)
+    assert "deg, 0.4 m)" in views[5].reason
     assert not np.array_equal(c2w[12], solution.c2w[12])
     assert views[12].reason.startswith("placed between its neighbours: ")
     assert views[12].sigma_rot_deg < 30
