@@ -36,7 +36,7 @@ RAYS = 512
 OF_VIEWS = ["views", "initial_c2w"]
 STEPS = {"kronc_splatfacto_cpu": 25, "kronc_tensorf_cpu": 25, "kronc_dvgo_cpu": 72}
 """All that changes on the way has happened by then: images are densified, grids have grown."""
-LONGER = {"kronc_splatfacto_cpu": 60, "kronc_tensorf_cpu": 40, "kronc_dvgo_cpu": 80}
+LONGER = {"kronc_splatfacto_cpu": 60, "kronc_tensorf_cpu": 100, "kronc_dvgo_cpu": 80}
 """What has been learned shows."""
 
 
