@@ -124,7 +124,7 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> "Table
     rmse, middle = report["rmse_px"], report["median_px"]
     if rmse is not None and middle is not None:
         table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {middle:.2f} px of all")
-    sigmas = [[view[key] for view in views if view[key] is not None] for key in ("sigma_rot_deg", "sigma_trans_m")]
+    sigmas = [[view[key] for view in views if view.get(key) is not None] for key in ("sigma_rot_deg", "sigma_trans_m")]
     if all(sigmas):
         rotation, centre = (median(values) for values in sigmas)
         table.add_row("standard deviation", f"{rotation:.2f} deg, {100 * centre:.1f} cm (median view)")

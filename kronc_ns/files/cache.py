@@ -11,7 +11,7 @@ import numpy as np
 from kronc_ns.errors import KroncError
 from kronc_ns.files.keypoints import describe_schema
 from kronc_ns.files.output import claim_output
-from kronc_ns.files.record import read_record, write_solution
+from kronc_ns.files.record import read_record, read_solution, write_solution
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import Progress, solve_scene
 from kronc_ns.scene import Scene
@@ -56,6 +56,9 @@ def solve_cached(data: Path, scene: Scene, config: KroncConfig, progress: Progre
 def _holds(folder: Path, inputs: str) -> bool:
     """Whether the cached solution is of these inputs; one that cannot be read is made anew."""
     try:
-        return read_record(folder).get("inputs") == inputs
+        if read_record(folder).get("inputs") != inputs:
+            return False
+        read_solution(folder)
+        return True
     except KroncError:
         return False

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from kronc_ns.errors import KroncError
-from kronc_ns.files.output import read_json
 from kronc_ns.files.record import KEYPOINT_COLOUR, solved_points
-from kronc_ns.files.transforms import cameras_and_frames, check_file_names, read_poses
+from kronc_ns.files.transforms import cameras_and_frames, check_file_names, read_poses, read_transforms
 from kronc_ns.geometry.poses import invert
 
 
@@ -19,9 +18,14 @@ def write_colmap(folder: Path, solved: Path) -> int:
     import pycolmap
 
     transforms = solved / "transforms.json"
-    cameras, frames = cameras_and_frames(read_json(transforms), transforms)
+    cameras, frames = cameras_and_frames(read_transforms(transforms), transforms)
     check_file_names([frame["file_path"] for frame in frames], transforms)
     poses = read_poses(transforms)
+    lacking = [frame["file_path"] for frame in frames if frame["file_path"] not in poses]
+    if lacking:
+        raise KroncError(
+            f"{transforms}: {lacking[0]} has no transform_matrix: expected one in every frame: solve again"
+        )
     model = pycolmap.Reconstruction()
     numbers = {camera: number for number, camera in enumerate(dict.fromkeys(cameras), start=1)}
     for camera, number in numbers.items():

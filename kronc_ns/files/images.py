@@ -56,12 +56,14 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
 
     try:
         if path.suffix == ".npy":
-            return np.load(path).astype(np.float64)
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError):
-        image = None
-    if image is None or image.ndim != 2:
+            depth = np.load(path).astype(np.float64)
+        else:
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            depth = None if image is None else image.astype(np.float64) * _DEPTH_UNIT_M
+    except (OSError, EOFError, ValueError, TypeError, AttributeError):  # the last of an archive of arrays
+        depth = None
+    if depth is None or depth.ndim != 2:
         raise KroncError(
             f"{path} is no depth map: expected a 16-bit single-channel image in millimetres or .npy in metres"
         )
-    return image.astype(np.float64) * _DEPTH_UNIT_M
+    return depth

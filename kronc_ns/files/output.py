@@ -67,7 +67,7 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise KroncError(f"{path} does not exist") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # ValueError also of characters, and of numbers of 4300 digits
         raise KroncError(f"{path} is not valid JSON ({error}): restore the file or write it anew") from None
     except OSError as error:
         raise KroncError(f"{path} cannot be read: {error.strerror}") from None
@@ -124,7 +124,7 @@ def _held(folder: Path) -> str | None:
     Empty where a version interrupted there did not say.
     """
     if (folder / MARKER).exists():
-        return (folder / MARKER).read_text()
+        return (folder / MARKER).read_text(errors="replace")
     if not (folder / "kronc.json").exists():
         return None
     try:

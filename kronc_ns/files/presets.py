@@ -40,9 +40,9 @@ def load_config(name_or_path: str | None = None, **overrides: Any) -> KroncConfi
 
         try:
             content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:
             raise KroncError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
-        config = _update(config, content or {}, str(path))
+        config = _update(config, {} if content is None else content, str(path))
     return replace(config, **{key: value for key, value in overrides.items() if value is not None})
 
 
@@ -82,7 +82,7 @@ def _check(value: Any, kind: Any, where: str) -> Any:
     if kind is float and not isinstance(value, bool):
         try:
             return float(value)  # also of text: YAML takes 1e-3 for a string
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             pass
     if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
         raise KroncError(f"{where}: {value!r} is not of the right kind: expected {kind.__name__}")

@@ -1,6 +1,7 @@
 """kronc.json, the evidence beside a solution's transforms.json: a solved folder written, and read back."""
 
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path, PurePosixPath
@@ -15,12 +16,29 @@ from kronc_ns.files.keypoints import match_keypoints, read_keypoints, sigma_of, 
 from kronc_ns.files.output import read_json, relative_path, release_output, write_json
 from kronc_ns.files.ply import write_points
 from kronc_ns.files.provenance import provenance
-from kronc_ns.files.transforms import INTRINSICS, cameras_and_frames, intrinsics_dict, read_poses, transforms_dict
+from kronc_ns.files.transforms import (
+    INTRINSICS,
+    cameras_and_frames,
+    intrinsics_dict,
+    read_poses,
+    read_transforms,
+    transforms_dict,
+)
 from kronc_ns.geometry.camera import Lenses
 from kronc_ns.geometry.poses import camera_z
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
 
+_NUMBER_OR_NONE = (int, float, type(None))
+_EVIDENCE = {
+    "visible": (int,),
+    "inliers": (int,),
+    "rmse_px": _NUMBER_OR_NONE,
+    "sigma_rot_deg": _NUMBER_OR_NONE,
+    "sigma_trans_m": _NUMBER_OR_NONE,
+    "swapped": (bool,),
+}
+"""Kinds of what kronc.json says of a view; all else is text."""
 KEYPOINT_COLOUR = np.array([200, 40, 40], dtype=np.uint8)
 
 
@@ -91,6 +109,9 @@ def read_record(folder: Path) -> dict[str, Any]:
     record = read_json(file)
     if not isinstance(record, dict):
         raise KroncError(f"{file}: expected an object, as `kronc solve` writes it: solve again")
+    for key, kind in {"version": str, "inputs": str, "command": str, "versions": dict}.items():
+        if not isinstance(record.get(key, kind()), kind):  # no solution needs them
+            raise _lacks(folder, key)
     return record
 
 
@@ -110,16 +131,19 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         initial = _poses(record["initial_c2w"], len(views))
         path = np.stack([initial, *(_poses(step, len(views)) for step in record.get("path_c2w", []))])[1:]
         history = {key: _array(values, (-1,)).tolist() for key, values in record["history"].items()}
-        overall: dict[str, Any] = {key: record[key] for key in ("reason", "solver", "init", "iterations", "seconds")}
+        overall: dict[str, Any] = {key: _checked(record[key], key, str) for key in ("reason", "solver", "init")}
+        overall |= {"iterations": _checked(record["iterations"], "iterations", int)}
+        overall |= {"seconds": _checked(record["seconds"], "seconds", int, float)}
         for key in ("rmse_px", "median_px"):
-            overall[key] = math.nan if record[key] is None else float(record[key])
+            overall[key] = math.nan if record[key] is None else float(_checked(record[key], key, int, float))
         status = Status(record["status"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise KroncError(f"{file} is not as `kronc solve` writes it ({error!r}): solve again") from None
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise KroncError(f"{file} is not as `kronc solve` writes it ({error!r:.200}): solve again") from None
 
     transforms = folder / "transforms.json"
     # of failed views transforms.json says nothing
-    cameras, _ = cameras_and_frames({**read_json(transforms), "frames": record["views"]}, transforms)
+    content = {**read_transforms(transforms), "frames": record["views"]}
+    cameras, _ = cameras_and_frames(content, file if any("fl_x" in view for view in record["views"]) else transforms)
     lenses = Lenses.of(cameras)
     camera = cameras[0] if lenses is None else lenses.usual
     poses = read_poses(transforms)
@@ -155,7 +179,7 @@ def solved_points(folder: Path) -> Float[np.ndarray, "j 3"]:
     record = read_record(folder)
     try:
         return _array([point for point in record["points"] if None not in point], (-1, 3))
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise _lacks(folder, "points") from None
 
 
@@ -184,12 +208,22 @@ def _as_listed(names: Sequence[str], listed: Iterable[str]) -> tuple[str, ...]:
 
 def _view(view: dict[str, Any]) -> ViewReport:
     evidence = {key: value for key, value in view.items() if key not in ("file_path", *INTRINSICS)}
+    for key, value in evidence.items():
+        _checked(value, key, *_EVIDENCE.get(key, (str,)))
     return ViewReport(**{**evidence, "name": view["file_path"], "status": ViewStatus(view["status"])})
 
 
 def _poses(poses: list[list[float] | None], count: int) -> Float[np.ndarray, "n 3 4"]:
     """Rows of twelve numbers, null where there is no pose."""
     return _array([pose or [None] * 12 for pose in poses], (count, 3, 4))
+
+
+def _checked(value: Any, key: str, *kinds: type) -> Any:
+    """A value of just one of these ``kinds``, and finite if it is a number; else `ValueError`."""
+    endless = isinstance(value, int | float) and not abs(value) <= sys.float_info.max  # also of NaN
+    if endless or type(value) not in kinds:
+        raise ValueError(f"{key} is {value!r:.100}")
+    return value
 
 
 def _array(values: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:

@@ -15,6 +15,7 @@ from kronc_ns.geometry.poses import flip_camera_axes
 
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
 """nerfstudio's names of a camera's numbers."""
+_LARGEST = 1e9
 
 
 def transforms_dict(
@@ -91,16 +92,27 @@ def cameras_and_frames(content: Any, file: Path) -> tuple[list[Camera], list[dic
         try:
             numbers = [float(0.0 if merged[key] is None else merged[key]) for key in INTRINSICS]
             width, height = map(int, numbers[4:6])
+            if max(map(abs, numbers)) > _LARGEST:  # whose squares may overflow
+                raise ValueError
         except (TypeError, ValueError, OverflowError):
-            raise KroncError(f"{file}: intrinsics {merged} are not all finite numbers") from None
+            raise KroncError(
+                f"{file}: intrinsics {_short(merged)} are not all finite numbers: expected pixels, and coefficients"
+            ) from None
         fx, fy, cx, cy = numbers[:4]
         cameras.append(Camera(fx, fy, cx, cy, width, height, *numbers[6:]))
     return cameras, frames
 
 
+def read_transforms(file: Path) -> dict[str, Any]:
+    """Content of a transforms file, of which "frames" are known to be objects with a "file_path", and no more."""
+    content = read_json(file)
+    _frames(content, file)
+    return content
+
+
 def read_poses(file: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
     """Camera-to-world poses (OpenCV axes) by ``file_path``, of the frames that have one, from a transforms file."""
-    posed = [frame for frame in _frames(read_json(file), file) if frame.get("transform_matrix") is not None]
+    posed = [frame for frame in read_transforms(file)["frames"] if frame.get("transform_matrix") is not None]
     return {str(frame["file_path"]): _pose(frame, file) for frame in posed}
 
 
@@ -114,20 +126,33 @@ def given_poses(frames: list[dict[str, Any]], file: Path) -> Float[np.ndarray, "
 def _frames(content: Any, file: Path) -> list[dict[str, Any]]:
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):
-        raise KroncError(f'{file}: expected "frames", a list of objects with "file_path", as nerfstudio writes it')
+        raise KroncError(
+            f'{file}: expected "frames", a list of objects with "file_path", as nerfstudio writes it: '
+            "restore the file or write it anew"
+        )
+    odd = [frame["file_path"] for frame in frames if not isinstance(frame["file_path"], str) or not frame["file_path"]]
+    if odd:
+        raise KroncError(f"{file}: file_path {_short(odd[0])} is no path: expected that of an image, as text")
     return frames
+
+
+def _short(value: Any) -> str:
+    """A value of a file in an error, which is to stay on a line."""
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 def _pose(frame: dict[str, Any], file: Path) -> Float[np.ndarray, "3 4"]:
     where = f"{file}, {frame['file_path']}"
     try:
         matrix = np.asarray(frame["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise KroncError(f"{where}: transform_matrix must be 4x4 finite numbers (camera to world)")
     rotation = matrix[:3, :3]
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+    larger = np.abs(rotation).max() > 2  # than any entry of a rotation; its square may overflow
+    if larger or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
         raise KroncError(f"{where}: transform_matrix holds no rotation: expected an orthonormal, right-handed 3x3 part")
     u, _, vh = np.linalg.svd(rotation)
     clean = np.concatenate([u @ vh, matrix[:3, 3:]], axis=1)

@@ -1,6 +1,8 @@
 """Vehicles cut out of their background."""
 
 import hashlib
+import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,9 +19,22 @@ from kronc_ns.files.output import atomic_path
 def cut_out(images: Sequence[Path], masks: Sequence[Path]) -> list[Path]:
     """RGBA copies of images whose alpha is the mask (times their own alpha), kept in the cache.
 
-    A copy is named by the content of its sources and made once.
+    A copy is made once, and named by the content of its sources. What is returned are links to the copies, in one
+    folder and under the images' names, by which nerfstudio calls renderings and exported cameras.
     """
-    return [_cut_out(image, mask) for image, mask in zip(images, masks, strict=True)]
+    copies = [_cut_out(image, mask) for image, mask in zip(images, masks, strict=True)]
+    alike = Counter(image.stem for image in images)
+    names = [f"{image.stem if alike[image.stem] == 1 else image.name}.png" for image in images]
+    content = hashlib.sha256(repr([(name, copy.name) for name, copy in zip(names, copies, strict=True)]).encode())
+    folder = cache_folder() / "cut_out" / "named" / content.hexdigest()[:32]
+    return [_linked(folder / name, copy) for name, copy in zip(names, copies, strict=True)]
+
+
+def _linked(link: Path, copy: Path) -> Path:
+    if not link.exists():
+        with atomic_path(link) as temporary:
+            temporary.symlink_to(os.path.relpath(copy, link.parent))
+    return link
 
 
 def _cut_out(image: Path, mask: Path) -> Path:

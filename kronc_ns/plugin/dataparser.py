@@ -102,12 +102,13 @@ class KroncDataParser(DataParser):
         if not (folder / "kronc.json").exists() or own_keypoints or config.any_solver_option():
             with solving("solving poses") as progress:
                 folder = solve_cached(config.data, scene, config.solver_config(), progress)
+        solution = read_solution(folder)[1]  # which names what is broken
         record = read_record(folder)
         CONSOLE.print(report_table(record, scene.notes))
         doubt = exit_status(record)
         if record["status"] == Status.FAILED.value:
             sys.exit(doubt)
-        return scene, read_solution(folder)[1]
+        return scene, solution
 
     def _outputs(self, split: str, scene: Scene, solution: Solution) -> DataparserOutputs:
         config = self.config

@@ -87,7 +87,7 @@ def check_parameters(parameters: Mapping[str, Tensor], step: int) -> None:
 
 @torch.enable_grad()
 def refined_pose(
-    model: Model, camera: Cameras, batch: Mapping[str, Tensor], whole: bool, generator: torch.Generator
+    model: Model, camera: Cameras, batch: Mapping[str, Any], whole: bool, generator: torch.Generator
 ) -> Float[Tensor, "3 4"]:
     """c2w (OpenGL axes) near that of ``camera [1]`` from which ``model`` explains the image in ``batch`` best.
 

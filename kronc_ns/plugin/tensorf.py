@@ -9,6 +9,8 @@ from nerfstudio.field_components.encodings import TensorVMEncoding
 from nerfstudio.models.tensorf import TensoRFModel, TensoRFModelConfig
 from torch import Tensor
 
+from kronc_ns.plugin.transparency import rgba
+
 
 @dataclass
 class PosableTensoRFModelConfig(TensoRFModelConfig):
@@ -42,3 +44,10 @@ class PosableTensoRFModel(TensoRFModel):
         if self.config.camera_optimizer.mode != "off" and self.config.tensorf_encoding == "vm":
             self.field.density_encoding = PosableVMEncoding(self.init_resolution, self.num_den_components)
             self.field.color_encoding = PosableVMEncoding(self.init_resolution, self.num_color_components)
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Float[Tensor, "*n 4"]:
+        """Colour and opacity of a rendering; opaque where its background is what the ray's last sample shows."""
+        background = self.config.background_color
+        if background == "last_sample":
+            return super().get_rgba_image(outputs, output_name)
+        return rgba(outputs[output_name], outputs["accumulation"], background)

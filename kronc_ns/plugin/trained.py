@@ -112,7 +112,7 @@ def _read_config(file: Path) -> TrainerConfig:
         raise KroncError(f"{file} does not exist: expected the config.yml of a run, whose path ns-train prints")
     try:
         config = yaml.load(file.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    except (yaml.YAMLError, UnicodeDecodeError):
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError):  # of objects that are none
         config = None
     if not isinstance(config, TrainerConfig):
         raise KroncError(f"{file} is no config.yml of a run: expected what ns-train wrote")

@@ -73,7 +73,7 @@ def _read_points(file: Path) -> Float[np.ndarray, "66 3"]:
         raise KroncError(f"{file}: expected schema {APOLLOCAR3D_66.name!r}")
     try:
         points = np.asarray(content["keypoints"], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         points = np.zeros(0)
     if points.shape != (len(APOLLOCAR3D_66), 3) or not np.isfinite(points).all():
         raise KroncError(

@@ -96,11 +96,15 @@ def test_other_options_have_another_place(walk_folder, scene, solves):
     assert solves == options
 
 
-def spoil(text: str) -> Callable[[Path], object]:
-    return lambda folder: (folder / "kronc.json").write_text(text)
+def spoil(text: str, file: str = "kronc.json") -> Callable[[Path], object]:
+    return lambda folder: (folder / file).write_text(text)
 
 
-@pytest.mark.parametrize("spoilt", [*map(spoil, ["{", "[]", '{"inputs": "of something else"}']), claim_output])
+SPOILT = [spoil("{"), spoil("[]"), spoil('{"inputs": "of something else"}'), claim_output]
+SPOILT += [spoil(text, file) for text in ("null", "[") for file in ("transforms.json", "keypoints.json")]
+
+
+@pytest.mark.parametrize("spoilt", SPOILT)
 def test_what_is_broken_or_was_interrupted_is_made_anew(walk_folder, scene, solves, spoilt):
     folder = solve_cached(walk_folder, scene, DEFAULTS, None)
     spoilt(folder)

@@ -48,7 +48,14 @@ def test_depth_maps_are_millimetres_or_metres(written, tmp_path):
 def test_what_is_no_depth_map_is_named(written, tmp_path):
     (tmp_path / "a.npy").write_text("no array")
     colour = written(np.zeros((2, 2, 3), np.uint8))
-    for file in (colour, tmp_path / "a.npy", tmp_path / "none.png", tmp_path / "none.npy"):
+    odd = {"flat": np.zeros(4), "cube": np.zeros((2, 2, 2)), "text": np.array([["a"]]), "any": np.array([[None, {}]])}
+    for name, array in odd.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    (tmp_path / "empty.npy").touch()
+    with (tmp_path / "archive.npy").open("wb") as archive:
+        np.savez(archive, np.zeros((2, 2)))
+    names = ["a", "none", "empty", "archive", *odd]
+    for file in (colour, tmp_path / "none.png", *(tmp_path / f"{name}.npy" for name in names)):
         with pytest.raises(KroncError, match=f"{file.name} is no depth map: expected a 16-bit"):
             read_depth(file)
 

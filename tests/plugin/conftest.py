@@ -27,6 +27,7 @@ def _cache(tmp_path_factory: pytest.TempPathFactory, compiled_solver: None) -> I
 @pytest.fixture(scope="module")
 def without_lpips() -> Iterator[None]:
     """No LPIPS, which takes longest to build and whose weights may be missing."""
+    import kronc_ns.plugin.methods  # noqa: F401 - replaces LPIPS itself when first imported, and for good
     from kronc_ns.plugin.compatibility import UnavailableLpips
 
     with pytest.MonkeyPatch.context() as patch:

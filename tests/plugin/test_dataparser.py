@@ -302,6 +302,49 @@ def test_an_images_own_alpha_stays(tmp_path):
     np.testing.assert_array_equal(pixels(copy)[..., 3], expected)
 
 
+def test_copies_are_called_as_their_images_and_made_once(rendered, fresh_cache):
+    images, masks = (sorted((rendered / kind).iterdir())[:3] for kind in ("images", "masks"))
+    copies = cut_out(images, masks)
+    assert [copy.name for copy in copies] == [image.name for image in images]
+    assert len({copy.parent for copy in copies}) == 1
+    made = {copy: copy.resolve().stat().st_mtime_ns for copy in copies}
+    assert cut_out(images, masks) == copies
+    others = cut_out(images[1:], masks[1:])
+    assert [copy.resolve() for copy in others] == [copy.resolve() for copy in copies[1:]]
+    assert made == {copy: copy.resolve().stat().st_mtime_ns for copy in copies}
+    copies[0].resolve().unlink()
+    assert pixels(cut_out(images, masks)[0]).shape[-1] == 4
+
+
+def test_copies_of_images_that_only_suffixes_tell_apart_have_names_of_their_own(tmp_path):
+    images = [tmp_path / name for name in ("a.png", "a.jpg", "b.jpg")]
+    for number, image in enumerate(images):
+        Image.new("RGB", (6, 4), (60 * number, 0, 0)).save(image)
+    Image.new("L", (6, 4), 255).save(tmp_path / "mask.png")
+    copies = cut_out(images, [tmp_path / "mask.png"] * 3)
+    assert [copy.name for copy in copies] == ["a.png.png", "a.jpg.png", "b.png"]
+    assert [int(pixels(copy)[0, 0, 0]) // 50 for copy in copies] == [0, 1, 2]
+
+
+def test_cameras_have_room_for_what_nerfstudios_exporter_notes(outputs):
+    camera = outputs("train").cameras[:1]
+    camera.metadata["cam_idx"] = 0
+    assert outputs("train").cameras.metadata == {}
+
+
+@pytest.mark.parametrize("content", ["null", "[]", '{"frames": 3}', "{"])
+@pytest.mark.parametrize("file", ["transforms.json", "kronc.json", "keypoints.json"])
+def test_broken_files_of_a_solved_folder_are_named(solved_lap_folder, tmp_path, capsys, file, content):
+    out = Path(shutil.copytree(solved_lap_folder, tmp_path / "out"))
+    (out / file).write_text(content)
+    with pytest.raises(SystemExit) as ended:
+        KroncDataParserConfig(data=out).setup().get_dataparser_outputs("train")
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {out / file}")
+    assert error.count("\n") == 1
+
+
 def test_masks_that_do_not_fit_are_refused(tmp_path):
     Image.new("RGB", (6, 4)).save(tmp_path / "image.png")
     Image.new("L", (4, 6)).save(tmp_path / "mask.png")

@@ -347,6 +347,19 @@ def test_rendering_is_the_same_before_and_after_loading(trained):
     assert centre == pytest.approx(3 - RADIUS, abs=0.2)
     assert found["accumulation"][12, 12] > 0.9
     torch.testing.assert_close(found["rgb"][0, 0], torch.ones(3))  # white where there is nothing
+    rgba = other.get_rgba_image(found)
+    assert rgba[0, 0, 3] < 0.1
+    assert rgba[12, 12, 3] > 0.9
+
+
+def test_rays_that_are_hardly_held_up_end_behind_the_box():
+    model = tiny_model().eval()
+    model.coarse.density_grid.values.data += 5
+    aabb = model.coarse.density_grid.aabb
+    rays = RayBundle(torch.tensor([[0.1, 0.1, 9.0]]), torch.tensor([[0.0, 0, -1]]), pixel_area=torch.ones(1, 1))
+    outputs = model(rays)
+    assert 0 < outputs["accumulation"] < 0.5
+    assert outputs["depth"].item() == pytest.approx(9 - aabb[0, 2].item(), abs=1e-4)
 
 
 @pytest.mark.parametrize("fine", [False, True])

@@ -28,7 +28,8 @@ from kronc_ns.plugin.dvgo import equations
 from kronc_ns.plugin.dvgo.field import CoarseField, DensityGridField, FineField, view_rates
 from kronc_ns.plugin.dvgo.grid import UnknownSpace
 from kronc_ns.plugin.dvgo.losses import StageLosses, beside_photometric
-from kronc_ns.plugin.dvgo.sampling import sample_rays
+from kronc_ns.plugin.dvgo.sampling import ray_box, sample_rays
+from kronc_ns.plugin.transparency import rgba
 
 
 @dataclass
@@ -214,10 +215,17 @@ class DVGOModel(Model):
         accumulation = self.renderer_accumulation(weights, ray_indices=rays, num_rays=packed.num_rays)
         distance = (samples.frustums.starts + samples.frustums.ends) / 2
         depth = torch.zeros_like(accumulation).index_add(0, rays, weights * distance) / accumulation.clamp(min=1e-6)
+        # as nerfstudio's median depth: of a ray that is hardly held up, a surface would be anywhere
+        leaving = ray_box(ray_bundle.origins, ray_bundle.directions, field.density_grid.aabb)[1][:, None]
+        depth = torch.where(accumulation < 0.5, leaving.clamp(min=0), depth)
         outputs = {"rgb": rgb, "accumulation": accumulation, "depth": depth}
         if self.training:
             outputs |= {"background": background, "point_rgb": colours, "point_weights": weights, "point_rays": rays}
         return outputs
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Float[Tensor, "*n 4"]:
+        """Colour and opacity of a rendering."""
+        return rgba(outputs[output_name], outputs["accumulation"], self.config.background_color)
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """PSNR of the batch."""

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from kronc_ns.plugin.splat_cpu.rendering import rasterization
+from kronc_ns.plugin.transparency import rgba
 
 
 @dataclass
@@ -67,3 +68,8 @@ class SplatfactoCpuModel(SplatfactoModel):
             return super().get_outputs(camera)
         with StayOnCpu():
             return self._get_outputs_on_cpu(camera)
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Colour and opacity of a rendering, which nerfstudio looks for in a renderer that splatfacto has not."""
+        rgb = outputs[output_name]
+        return rgba(rgb, outputs["accumulation"], outputs["background"].expand(rgb.shape))

@@ -104,15 +104,16 @@ def residual_histogram(error: Float[np.ndarray, "n j"], inlier: Bool[np.ndarray,
 
 
 def convergence(solution: Solution) -> go.Figure | None:
-    """The solver's loss over its steps; None where none were recorded."""
+    """The solver's loss over its steps; None where none were recorded, or none was finite."""
     steps, loss = (solution.history.get(key, ()) for key in ("step", "loss"))
-    if not steps or not loss:
+    finite = [value for value in loss if math.isfinite(value)]
+    if not steps or not finite:
         return None
     mode = "lines+markers" if len(steps) <= _MARKED_STEPS else "lines"
     figure = go.Figure(go.Scatter(x=list(steps), y=list(loss), mode=mode, meta="solved", name="loss"))
     figure.update_layout(_layout(), showlegend=False)
     figure.update_xaxes(title="step")
-    figure.update_yaxes(title="loss", **_axis(loss))
+    figure.update_yaxes(title="loss", **_axis(finite))
     return figure
 
 
