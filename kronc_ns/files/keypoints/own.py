@@ -65,7 +65,7 @@ def _rows(values: Any, schema: KeypointSchema, where: str) -> Float[np.ndarray, 
     """(u, v, confidence) rows, checked; unseen rows become zeros."""
     try:
         rows = np.asarray(values, dtype=np.float64).reshape(-1, 3)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise KroncError(f"{where}: keypoints are not numbers [u, v, confidence]") from None
     if len(rows) != len(schema):
         raise KroncError(f"{where}: {len(rows)} keypoints, expected {len(schema)} for schema {schema.name!r}")
