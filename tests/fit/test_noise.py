@@ -37,7 +37,7 @@ def test_with_much_freedom_it_is_what_the_residuals_show():
 
 
 def test_with_none_it_is_that_of_common_detectors():
-    """Two views of twelve points: any fit is perfect, and says nothing of the noise."""
+    """Two views of four points: any fit is perfect, and says nothing of the noise."""
     noise = fitted(2, 4, 0.0)
     assert noise.freedom <= 0
     assert noise.sigma_px == pytest.approx(0.002 * DIAGONAL_PX)
