@@ -19,7 +19,8 @@ class SolverOptions:
     config: str | None = None
     """Preset (paper_synthetic, paper_real, phone_walk, turntable) or path to a YAML file of options."""
     solver: Solver | None = None
-    """lm (default): robust second-order solver; adam: Algorithm 1 of the paper."""
+    """lm (default): robust second-order solver; adam: Algorithm 1 of the paper; none: given poses as they are, for
+    methods that find poses themselves (barf, l2g-nerf)."""
     init: InitChoice | None = None
     """Initial poses: a car template found in each view, the paper's circle, those in transforms.json, or (auto)
     whichever leads to the best fit."""

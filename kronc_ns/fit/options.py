@@ -9,7 +9,7 @@ from kronc_ns.solve.options import AdamConfig, LmConfig
 
 Direction = Literal["ccw", "cw"]
 """Sense in which a circle is walked, seen from above."""
-Solver = Literal["lm", "adam"]
+Solver = Literal["lm", "adam", "none"]
 InitChoice = Literal["auto", "template", "circular", "given"]
 MinStatus = Literal["completed", "solved"]
 
@@ -19,7 +19,7 @@ class KroncConfig:
     """How a scene is solved; the presets in ``configs/`` are values of this."""
 
     solver: Solver = "lm"
-    """lm: robust second-order solver; adam: Algorithm 1 of the paper."""
+    """lm: robust second-order solver; adam: Algorithm 1 of the paper; none: given poses are handed on as they are."""
     init: InitChoice = "auto"
     """Initial poses: a car template found in each view, the paper's circle, those given in transforms.json, or
     (auto) whichever of these leads to the best fit."""
@@ -68,7 +68,13 @@ class KroncConfig:
                 f"adam.weight_2d and adam.weight_3d are {weights[0]:g} and {weights[1]:g}: "
                 "expected finite numbers from 0 on, and not both 0"
             )
-        if self.solver == "adam" and (self.refine_focal or self.refine_k1):
-            raise KroncError('refine_focal and refine_k1 need solver "lm": adam takes the intrinsics as given')
-        if self.solver == "lm" and self.depth_init != "random":
-            raise KroncError(f'depth_init {self.depth_init!r} needs solver "adam": lm has no depths to start from')
+        if self.solver != "lm" and (self.refine_focal or self.refine_k1):
+            raise KroncError(
+                f'refine_focal and refine_k1 need solver "lm": {self.solver} takes the intrinsics as given'
+            )
+        if self.solver != "adam" and self.depth_init != "random":
+            raise KroncError(
+                f'depth_init {self.depth_init!r} needs solver "adam": {self.solver} has no depths to start from'
+            )
+        if self.solver == "none" and self.init not in ("auto", "given"):
+            raise KroncError(f'init {self.init!r} needs a solver: "none" hands given poses on as they are')

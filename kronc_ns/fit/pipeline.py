@@ -27,6 +27,7 @@ from kronc_ns.fit.starts import (
     start_from_template,
     usable_views,
 )
+from kronc_ns.fit.unsolved import unsolved
 from kronc_ns.fit.verdict import Evidence, judge
 from kronc_ns.geometry.alignment import Similarity, umeyama
 from kronc_ns.geometry.camera import rays
@@ -87,6 +88,8 @@ def _solve_some(scenes: Sequence[Scene], config: KroncConfig, progress: Progress
             _check(scene, config)
         except KroncError as error:
             outcome[i] = error
+    if config.solver == "none":
+        return [outcome[i] if i in outcome else unsolved(scene) for i, scene in enumerate(scenes)]
     possible = [i for i in range(len(scenes)) if i not in outcome]
     attempts: Sequence[Attempt | KroncError] = (
         _lm([scenes[i] for i in possible], config, progress)
@@ -106,6 +109,11 @@ def _check(scene: Scene, config: KroncConfig) -> None:
 
         if not gpu_is_there():
             raise KroncError('device "cuda" was asked for, but torch finds no CUDA GPU: use "cpu" or "auto"')
+    if config.solver == "none" and scene.given_c2w is None:
+        raise KroncError(
+            'solver "none" takes poses as they are: expected a transform_matrix in every frame of transforms.json '
+            "(and no solution beside it)"
+        )
     if config.init == "given" and scene.given_c2w is None:
         raise KroncError(
             'init="given" needs a transform_matrix in every frame of transforms.json (and no solution beside it): '

@@ -2,9 +2,10 @@
 
 ``kronc-*`` have the settings of KRONC's experiments, ``kronc-*-cpu`` train in at most five minutes on two CPU cores
 with images of about 200 px. Poses are refined during training where ``--pipeline.model.camera-optimizer.mode SO3xR3``
-asks for it.
+asks for it; ``barf`` and ``l2g-nerf`` always refine them, and ``barf-cpu`` and ``l2g-nerf-cpu`` expect about 100 px.
 """
 
+import dataclasses
 from typing import Any
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -19,6 +20,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from kronc_ns.plugin.barf.cameras import LocalToGlobalPosesConfig
+from kronc_ns.plugin.barf.model import BarfModelConfig, L2GModelConfig
 from kronc_ns.plugin.compatibility import allow_numpy_in_checkpoints, train_without_lpips_weights
 from kronc_ns.plugin.dataparser import KroncDataParserConfig
 from kronc_ns.plugin.dvgo.model import DVGOModelConfig
@@ -269,4 +272,54 @@ kronc_splatfacto_cpu = _on_cpu(
     ),
     _splat_optimizers(3000, faster=4.0),
     "Splatfacto on KRONC poses without CUDA, sized to train in a few minutes on two CPU cores.",
+)
+
+
+# ---- BARF and L2G-NeRF
+
+
+def _barf(name: str, model: BarfModelConfig, description: str) -> MethodSpecification:
+    """As in BARF's synthetic scenes: 200k steps of 1024 rays with 128 samples each, and no finer ones among them.
+
+    Rates fall from 5e-4 to 1e-4, those of poses from 1e-3 to 1e-5.
+    """
+    steps = 200_000
+    optimizers = {"fields": _adam(5e-4, 1e-4, steps), "camera_opt": _adam(1e-3, 1e-5, steps)}
+    return _on_gpu(name, steps, _on_rays(1024, model, KroncDataParserConfig()), optimizers, description)
+
+
+barf = _barf("barf", BarfModelConfig(), "BARF (ICCV 2021): poses are found while a field trains, coarse to fine.")
+l2g_nerf = _barf("l2g-nerf", L2GModelConfig(), "L2G-NeRF (CVPR 2023): BARF by local motions of rays.")
+
+
+def _barf_cpu(name: str, steps: int, model: BarfModelConfig, description: str) -> MethodSpecification:
+    """A few hundredths of the steps, a small network without viewing directions, few rays and samples, larger rates.
+
+    The first frequencies are on from the start and poses wait until the field shows something: neither loses more
+    than the fine detail that a start of a few degrees could not use yet.
+    """
+    model = dataclasses.replace(
+        model,
+        frequencies=6,
+        direction_frequencies=None,
+        coarse_until=-900,
+        fine_from=1800,
+        poses_from=250,
+        depth=4,
+        width=64,
+        skip=None,
+        samples=32,
+    )
+    pipeline = _on_rays(512, model, KroncDataParserConfig())
+    pipeline.test_pose_steps = 150
+    optimizers = {"fields": _adam(5e-3, 5e-4, steps), "camera_opt": _adam(3e-3, 3e-4, steps)}
+    return _on_cpu(name, steps, pipeline, optimizers, description)
+
+
+barf_cpu = _barf_cpu("barf-cpu", 4000, BarfModelConfig(), "BARF, sized to train in some minutes on two CPU cores.")
+l2g_nerf_cpu = _barf_cpu(
+    "l2g-nerf-cpu",
+    6000,  # motions of single rays carry their cameras along more slowly
+    L2GModelConfig(camera_optimizer=LocalToGlobalPosesConfig(mode="SE3", warp_depth=4, warp_width=64, code_size=32)),
+    "L2G-NeRF, sized to train in some minutes on two CPU cores.",
 )

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -94,20 +94,26 @@ def load_run(config_file: Path) -> TrainedRun:
 
     Raises `KroncError` where that is no such file, its method is not installed, or it has no checkpoint or test view.
     """
-    config = _read_config(config_file)
-    checkpoints = config.get_checkpoint_dir()
-    if not any(checkpoints.glob("step-*.ckpt")):
-        raise KroncError(
-            f"{checkpoints} holds no checkpoint: train to the end, or come to the folder where ns-train was started"
-        )
-    photos = _photos(config.pipeline.datamanager)
+    config = read_config(config_file)
+    check_trained(config)
+    photos = photos_of(config.pipeline.datamanager, "test")
     if not len(photos):
         raise KroncError(f"{config_file}: its data set has no test views to render")
     _, pipeline, _, step = eval_setup(config_file)
     return TrainedRun(str(config.method_name), step, pipeline, photos)
 
 
-def _read_config(file: Path) -> TrainerConfig:
+def check_trained(config: TrainerConfig) -> None:
+    """Raise `KroncError` where a run has no checkpoint."""
+    checkpoints = config.get_checkpoint_dir()
+    if not any(checkpoints.glob("step-*.ckpt")):
+        raise KroncError(
+            f"{checkpoints} holds no checkpoint: train to the end, or come to the folder where ns-train was started"
+        )
+
+
+def read_config(file: Path) -> TrainerConfig:
+    """The config.yml that `ns-train` wrote; raises `KroncError` where it is none, or its method not installed."""
     if not file.is_file():
         raise KroncError(f"{file} does not exist: expected the config.yml of a run, whose path ns-train prints")
     try:
@@ -121,11 +127,11 @@ def _read_config(file: Path) -> TrainerConfig:
     return config
 
 
-def _photos(manager: Any) -> InputDataset:
-    """The test views of a datamanager's config at the size that is trained on."""
+def photos_of(manager: Any, split: Literal["train", "test"]) -> InputDataset:
+    """A split of a datamanager's config, its files by their own names, at the size that is trained on."""
     parser = manager.dataparser if manager.data is None else dataclasses.replace(manager.dataparser, data=manager.data)
     if isinstance(parser, KroncDataParserConfig):
         # the same views under their own names, with the masks that other backgrounds use up or leave aside
         parser = dataclasses.replace(parser, background="mask")
-    outputs = parser.setup().get_dataparser_outputs(split="test")
+    outputs = parser.setup().get_dataparser_outputs(split=split)
     return InputDataset(dataclasses.replace(outputs, alpha_color=None), manager.camera_res_scale_factor)

@@ -1,0 +1,34 @@
+"""Positional encoding whose frequencies are switched on from coarse to fine (BARF, section 3.3)."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def schedule(step: int, begin: int, end: int, frequencies: int) -> float:
+    """BARF's alpha at a ``step``: 0 up to ``begin``, rising evenly to all ``frequencies`` from ``end`` on."""
+    if step >= end:
+        return float(frequencies)
+    return frequencies * max(step - begin, 0.0) / (end - begin)
+
+
+def frequency_weights(alpha: float, frequencies: int) -> Float[Tensor, "l"]:
+    """BARF's weights w_k: (1 - cos(pi clamp(alpha - k, 0, 1))) / 2 of the frequency 2^k, k from 0 on."""
+    switched_on = (alpha - torch.arange(frequencies)).clamp(0, 1)
+    return (1 - torch.cos(math.pi * switched_on)) / 2
+
+
+def encode(x: Float[Tensor, "*n d"], weights: Float[Tensor, "l"]) -> Float[Tensor, "*n e"]:
+    """BARF's gamma(x; alpha): x, w_k sin(2^k pi x) and w_k cos(2^k pi x) for all k, e = d (1 + 2 l)."""
+    octaves = math.pi * 2.0 ** torch.arange(len(weights), device=x.device).repeat(2)
+    quarter = (torch.arange(len(octaves), device=x.device) >= len(weights)) * (math.pi / 2)
+    # cosines as sines a quarter of a wave ahead: a single pass over memory, there and back
+    waves = (x[..., None, :] * octaves[:, None] + quarter[:, None]).sin() * weights.repeat(2)[:, None]
+    return torch.cat([x, waves.flatten(-2)], dim=-1)
+
+
+def encoded_size(dimensions: int, frequencies: int) -> int:
+    """Length of what `encode` returns."""
+    return dimensions * (1 + 2 * frequencies)
