@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, UInt8
 
 from kronc_ns.geometry.camera import Camera, Lenses
 
@@ -49,6 +49,52 @@ class ViewReport:
 
 
 @dataclass(frozen=True)
+class Cloud:
+    """Points that image features were triangulated to, and where they were seen."""
+
+    points: Float[np.ndarray, "p 3"]
+    colours: UInt8[np.ndarray, "p 3"]
+    on_vehicle: Bool[np.ndarray, "p"]
+    first: Int[np.ndarray, "p1"]
+    """Sightings of point k are ``first[k]:first[k + 1]``."""
+    view: Int[np.ndarray, "s"]
+    """Of the solution's views."""
+    pixel: Float[np.ndarray, "s 2"]
+    """As photographed."""
+
+
+@dataclass(frozen=True)
+class ImageEvidence:
+    """What image features said of poses that keypoints gave."""
+
+    accepted: bool
+    reason: str
+    """Why their poses were taken, or were not."""
+    region: str
+    """vehicle or frame: where features were used."""
+    background_still: bool
+    """Whether the background stood still while the car turned."""
+    tracks_by_length: Sequence[int]
+    """How many tracks have been seen by 0, 1, 2, ... views."""
+    observations: Sequence[int]
+    """Of each view."""
+    held_out: int
+    """Tracks that no fit has seen."""
+    held_out_before_px: float | None
+    """Their median residual by the keypoints' poses; None where there are none."""
+    held_out_after_px: float | None
+    held_out_z: float
+    """By how many standard deviations they are met better (Wilcoxon)."""
+    keypoints_z: float
+    """By how many standard deviations the keypoints' chi-square rises beyond what is expected."""
+    noise_px: float | None
+    """Of features along one axis."""
+    focal_before_px: float
+    focal_after_px: float
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Solution:
     """Poses, points and the evidence for them, in a z-up world (OpenCV camera axes)."""
 
@@ -80,6 +126,10 @@ class Solution:
     """Where the cameras were at steps on the way, each in a frame of its own; NaN for views that took no part."""
     lenses: Lenses | None = None
     """The cameras of the views, where there are several."""
+    images: ImageEvidence | None = None
+    """Of a refinement by image features, accepted or not; None where none was tried."""
+    cloud: Cloud | None = None
+    """The features' points, where their poses were taken."""
 
     def camera_of(self, view: int) -> Camera:
         """The camera that took a view."""

@@ -11,8 +11,9 @@ LAYERS = [
     {"keypoints", "scene", "solution"},
     {"solve"},
     {"fit"},
+    {"refine"},
     {"show", "capture", "training", "synthetic", "metrics", "files"},
-    {"commands", "plugin", "benchmark"},
+    {"commands", "plugin", "fleet", "benchmark"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 MAY_USE_TORCH = (

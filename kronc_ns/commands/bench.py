@@ -22,11 +22,12 @@ _MOST_TRAININGS = 4  # at a time, of one thread and about 1.5 GB each
 class Bench:
     """Measure accuracy, speed or view synthesis on synthetic captures, beside what is asked of each row."""
 
-    suite: Literal["poses", "speed", "nvs", "detector", "trust"] = "poses"
+    suite: Literal["poses", "speed", "nvs", "detector", "trust", "fleet"] = "poses"
     """poses: errors beside those of the best that the data allow; speed: time and memory beside other solvers'; nvs:
     radiance fields trained on exact, solved and unsolved poses (CPU, half an hour on two cores); detector: points and
     poses from bare photos of --photos; trust: whether what is said of a solution is so, over captures with every kind
-    of trouble (trials from 100,000 on are those that the verdict was tuned on)."""
+    of trouble (trials from 100,000 on are those that the verdict was tuned on); fleet: `kronc fleet` on Ray nodes of
+    this machine."""
     seeds: int | None = None
     """Number of seeds of every row (default: what the row asks for)."""
     first_seed: int = 0
@@ -39,7 +40,7 @@ class Bench:
     adam_seeds: int | None = None
     """On so many seeds 10,000 steps of Adam run beside (default: none in poses, 1 in speed); half a minute each."""
     scenes: int = 1000
-    """Scenes of the throughput row."""
+    """Scenes of the throughput row; of fleet the most captures of a row (at 2,000 all are as asked)."""
     photos: Path | None = None
     """Of detector: folder with spin_suv, captures, car_parts and cars; rows of what is not there are left out."""
     detector_weights: Path | None = None
@@ -87,6 +88,10 @@ class Bench:
                     from kronc_ns.benchmark.suites.trust import trust_rows
 
                     rows = trust_rows(shapes)
+                case "fleet":
+                    from kronc_ns.benchmark.suites.fleet import fleet_rows
+
+                    rows = fleet_rows(self.scenes)
                 case _:
                     assert_never(self.suite)
             chosen = [row for row in rows if self.rows.lower() in row.name.lower()]

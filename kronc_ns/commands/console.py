@@ -111,7 +111,9 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> "Table
     swapped = sum(view.get("swapped", False) for view in views)
     table = Table(title=f"KRONC: {report['status']}", title_justify="left", show_header=False)
     table.add_row("views solved", f"{solved} of {len(views)}")
-    if completed:
+    if report["solver"] == "none":
+        table.add_row("views as given", f"{completed}, not solved")
+    elif completed:
         table.add_row(
             "views completed", f"{completed}: placed between their neighbours (--min-status solved omits them)"
         )
@@ -128,6 +130,12 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> "Table
     if all(sigmas):
         rotation, centre = (median(values) for values in sigmas)
         table.add_row("standard deviation", f"{rotation:.2f} deg, {100 * centre:.1f} cm (median view)")
+    images = report.get("images")
+    if images is not None:
+        taken = "taken" if images["accepted"] else "not taken"
+        table.add_row("image features", f"{taken} ({images['seconds']:.1f} s): {images['reason']}")
+        if images["background_still"]:
+            table.add_row("background", "stands still while the car turns: features on the vehicle alone")
     table.add_row("solver", f"{report['solver']} from {report['init']} poses, {report['iterations']} steps")
     table.add_row("time", f"{report['seconds']:.3f} s")
     for note in notes:

@@ -11,7 +11,9 @@ from kronc_ns.commands.convert_detector import ConvertDetector
 from kronc_ns.commands.detect import Detect
 from kronc_ns.commands.eval import Eval
 from kronc_ns.commands.export import Export
+from kronc_ns.commands.fleet import Fleet
 from kronc_ns.commands.import_data import Import
+from kronc_ns.commands.refine import Refine
 from kronc_ns.commands.report import Report
 from kronc_ns.commands.solve import Solve
 from kronc_ns.commands.synth import Synth
@@ -19,8 +21,10 @@ from kronc_ns.commands.view import View
 
 Command = (
     Annotated[Solve, tyro.conf.subcommand("solve")]
+    | Annotated[Refine, tyro.conf.subcommand("refine")]
     | Annotated[Detect, tyro.conf.subcommand("detect")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Fleet, tyro.conf.subcommand("fleet")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 
@@ -14,9 +15,13 @@ from kronc_ns.files.output import claim_output
 from kronc_ns.files.record import read_record, read_solution, write_solution
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import Progress, solve_scene
+from kronc_ns.refine.options import RefineConfig
 from kronc_ns.scene import Scene
+from kronc_ns.solution import Solution, Status
 
-_FORMAT = 8  # raised whenever the same input and options give another solution
+Refinement = tuple[RefineConfig, Callable[[Solution], Solution]]
+"""How solutions are refined by image features, and what does it."""
+_FORMAT = 9  # raised whenever the same input and options give another solution
 
 
 def cache_folder() -> Path:
@@ -25,8 +30,13 @@ def cache_folder() -> Path:
     return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "kronc_ns"
 
 
-def fingerprint(scene: Scene, config: KroncConfig) -> str:
-    """Hash of everything the solution of a scene depends on: contents, options and version, but no paths."""
+def fingerprint(
+    scene: Scene, config: KroncConfig, refine: RefineConfig | None = None, folder: Path | None = None
+) -> str:
+    """Hash of everything the solution of a scene depends on: contents, options and version, but no paths.
+
+    With ``refine`` also of the images in ``folder``, and their masks.
+    """
     settings = {**asdict(config), "device": None}
     given = scene.given_c2w if config.init in ("auto", "given") else None
     depths = scene.given_depths if config.depth_init != "random" else None
@@ -36,21 +46,40 @@ def fingerprint(scene: Scene, config: KroncConfig) -> str:
     digest = hashlib.sha256(header.encode())
     for array in (scene.keypoints, scene.sigma_px, given, depths):
         digest.update(b"-" if array is None else np.ascontiguousarray(array, dtype=np.float64).tobytes())
+    if refine is not None and folder is not None:
+        digest.update(json.dumps(asdict(refine)).encode())
+        for name in (*scene.names, *(scene.masks or ())):
+            digest.update(hashlib.blake2b(_content(folder / name)).digest())
     return digest.hexdigest()
 
 
-def solve_cached(data: Path, scene: Scene, config: KroncConfig, progress: Progress | None) -> Path:
+def solve_cached(
+    data: Path,
+    scene: Scene,
+    config: KroncConfig,
+    progress: Progress | None,
+    refine: Refinement | None = None,
+) -> Path:
     """Folder with the solution of a scene that was read from ``data``: the cached one, else solved now.
 
     A cache that cannot be written is an error.
     """
-    inputs = fingerprint(scene, config)
+    inputs = fingerprint(scene, config, refine[0], data) if refine else fingerprint(scene, config)
     folder = cache_folder() / inputs[:32]
     if not _holds(folder, inputs):
         solution = solve_scene(scene, config, progress)
+        if refine is not None and solution.status is not Status.FAILED:
+            solution = refine[1](solution)
         claim_output(folder)
         write_solution(folder, scene, solution, data, inputs)
     return folder
+
+
+def _content(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise KroncError(f"{file} cannot be read: {error.strerror}") from None
 
 
 def _holds(folder: Path, inputs: str) -> bool:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 import kronc_ns
 from kronc_ns.errors import KroncError
+from kronc_ns.files.cloud import read_cloud, write_cloud
 from kronc_ns.files.keypoints import match_keypoints, read_keypoints, sigma_of, write_keypoints
 from kronc_ns.files.output import read_json, relative_path, release_output, write_json
 from kronc_ns.files.ply import write_points
@@ -27,7 +28,7 @@ from kronc_ns.files.transforms import (
 from kronc_ns.geometry.camera import Lenses
 from kronc_ns.geometry.poses import camera_z
 from kronc_ns.scene import Scene
-from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
+from kronc_ns.solution import ImageEvidence, Solution, Status, ViewReport, ViewStatus
 
 _NUMBER_OR_NONE = (int, float, type(None))
 _EVIDENCE = {
@@ -52,10 +53,16 @@ def write_solution(folder: Path, scene: Scene, solution: Solution, data: Path, i
     masks = [relative_path(data, mask, folder) for mask in scene.masks] if scene.masks else None
     content = transforms_dict(solution.camera, names, solution.c2w, masks, lenses=solution.lenses)
     known = solution.points[np.isfinite(solution.points).all(-1)]
+    colours = np.tile(KEYPOINT_COLOUR, (len(known), 1))
+    if solution.cloud is not None:
+        known, colours = (
+            np.concatenate(of) for of in ((known, solution.cloud.points), (colours, solution.cloud.colours))
+        )
     (folder / "keypoints.ply").unlink(missing_ok=True)
     if len(known):
         content["ply_file_path"] = "keypoints.ply"
-        write_points(folder / "keypoints.ply", known, np.tile(KEYPOINT_COLOUR, (len(known), 1)))
+        write_points(folder / "keypoints.ply", known, colours)
+    write_cloud(folder, solution.cloud)
     write_json(folder / "transforms.json", content)
     if folder.resolve() != data.resolve():  # where they stand already
         rows = dict(zip(names, scene.keypoints, strict=True))
@@ -94,6 +101,7 @@ def solution_dict(solution: Solution) -> dict[str, Any]:
             }
             for i, view in enumerate(solution.views)
         ],
+        "images": None if solution.images is None else asdict(solution.images),
         "points": [[_number(x) for x in point] for point in solution.points.tolist()],
         "history": {key: [_number(x) for x in values] for key, values in solution.history.items()},
         "initial_c2w": [_rounded(pose) for pose in _flat(solution.initial_c2w)],
@@ -137,6 +145,8 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         for key in ("rmse_px", "median_px"):
             overall[key] = math.nan if record[key] is None else float(_checked(record[key], key, int, float))
         status = Status(record["status"])
+        images = record.get("images")
+        images = None if images is None else _images(images)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise KroncError(f"{file} is not as `kronc solve` writes it ({error!r:.200}): solve again") from None
 
@@ -169,6 +179,8 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         history=history,
         path=path,
         lenses=lenses,
+        images=images,
+        cloud=read_cloud(folder, len(views)),
         **overall,
     )
     return scene, solution
@@ -211,6 +223,18 @@ def _view(view: dict[str, Any]) -> ViewReport:
     for key, value in evidence.items():
         _checked(value, key, *_EVIDENCE.get(key, (str,)))
     return ViewReport(**{**evidence, "name": view["file_path"], "status": ViewStatus(view["status"])})
+
+
+def _images(said: dict[str, Any]) -> ImageEvidence:
+    """Evidence of image features; `TypeError` or `ValueError` where it is not as it was written."""
+    kinds = {"accepted": (bool,), "background_still": (bool,), "reason": (str,), "region": (str,), "held_out": (int,)}
+    lists = ("tracks_by_length", "observations")
+    for key, value in said.items():
+        if key in lists:
+            said = {**said, key: tuple(_checked(count, key, int) for count in value)}
+        else:
+            _checked(value, key, *kinds.get(key, _NUMBER_OR_NONE))
+    return ImageEvidence(**said)
 
 
 def _poses(poses: list[list[float] | None], count: int) -> Float[np.ndarray, "n 3 4"]:

@@ -1,5 +1,6 @@
 """Scene folders: images, transforms.json, keypoints.json, masks and depth maps become a `Scene`, checked."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -70,6 +71,14 @@ def load_scene(folder: Path | str, keypoints: Path | None = None, keypoint_names
         masks=masks if any(masks) else None,
         notes=(note,) if note else (),
     )
+
+
+def masks_of(folder: Path, names: Sequence[str]) -> tuple[str, ...] | None:
+    """``mask_path`` of the images of a solved folder; empty for views without a pose, None where there are no masks."""
+    file = folder / "transforms.json"
+    _, frames = cameras_and_frames(read_json(file), file)
+    masks = {str(frame["file_path"]): str(frame.get("mask_path", "")) for frame in frames}
+    return tuple(masks.get(name, "") for name in names) if any(masks.values()) else None
 
 
 def _without(found: Detections, file_names: set[str]) -> Detections:

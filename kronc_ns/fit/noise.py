@@ -43,8 +43,13 @@ def believed_noise(
     unknown += problem.lenses * len(problem.refine)
     freedom = 2 * int(counted.sum()) - unknown
     squares = float((problem.weight[counted] * np.square(error_px[counted])).sum())
+    return posterior(squares, freedom, diagonal_px)
+
+
+def posterior(squares_px: float, freedom: int, diagonal_px: float) -> Noise:
+    """The noise of a fit with so many degrees of freedom whose inliers have these summed squares."""
     known = max(freedom, 0) + _FREEDOM
-    sigma_px = math.sqrt((squares + _FREEDOM * (_COMMON * diagonal_px) ** 2) / known)
+    sigma_px = math.sqrt((squares_px + _FREEDOM * (_COMMON * diagonal_px) ** 2) / known)
     return Noise(sigma_px, _student(known) / _NORMAL, freedom)
 
 

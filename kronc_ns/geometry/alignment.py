@@ -22,6 +22,12 @@ class Similarity:
         """Everything stays where it is."""
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
+    @property
+    def inverse(self) -> "Similarity":
+        """The way back."""
+        back = self.rotation.T / self.scale
+        return Similarity(1 / self.scale, self.rotation.T, -back @ self.translation)
+
     def apply(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
         """Points carried into the target frame."""
         return self.scale * points @ self.rotation.T + self.translation

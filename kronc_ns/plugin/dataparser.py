@@ -21,8 +21,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from kronc_ns.commands.console import exit_on_error, exit_status, report_table, solving
+from kronc_ns.commands.image_options import ImageOptions
 from kronc_ns.commands.options import SolverOptions
-from kronc_ns.files.cache import solve_cached
+from kronc_ns.commands.refining import refine_with_bar
+from kronc_ns.files.cache import Refinement, solve_cached
 from kronc_ns.files.record import read_record, read_solution
 from kronc_ns.files.scene_folder import load_scene
 from kronc_ns.files.transforms import check_file_names
@@ -39,7 +41,7 @@ from kronc_ns.solution import Solution, Status
 
 
 @dataclass
-class KroncDataParserConfig(SolverOptions, DataParserConfig):
+class KroncDataParserConfig(SolverOptions, ImageOptions, DataParserConfig):
     """Poses from semantic keypoints: a scene folder with images, transforms.json (intrinsics) and keypoints.json."""
 
     _target: type = field(default_factory=lambda: KroncDataParser)
@@ -99,9 +101,10 @@ class KroncDataParser(DataParser):
         check_file_names(scene.names, config.data / "transforms.json")
         folder = config.data
         own_keypoints = config.keypoints is not None or config.keypoint_names is not None
-        if not (folder / "kronc.json").exists() or own_keypoints or config.any_solver_option():
+        own_options = config.any_solver_option() or config.any_image_option()
+        if not (folder / "kronc.json").exists() or own_keypoints or own_options:
             with solving("solving poses") as progress:
-                folder = solve_cached(config.data, scene, config.solver_config(), progress)
+                folder = solve_cached(config.data, scene, config.solver_config(), progress, self._refinement(scene))
         solution = read_solution(folder)[1]  # which names what is broken
         record = read_record(folder)
         CONSOLE.print(report_table(record, scene.notes))
@@ -109,6 +112,19 @@ class KroncDataParser(DataParser):
         if record["status"] == Status.FAILED.value:
             sys.exit(doubt)
         return scene, solution
+
+    def _refinement(self, scene: Scene) -> Refinement | None:
+        """How solutions are refined by images, where there are any."""
+        config, solver = self.config, self.config.solver_config()
+        refine = config.refine_config(solver.refine_focal, solver.refine_k1, solver.seed)
+        if refine is None or solver.solver == "none" or not (config.data / scene.names[0]).exists():
+            return None
+
+        def refined(solution: Solution) -> Solution:
+            right = scene.with_sides_swapped(np.array([view.swapped for view in solution.views]))
+            return refine_with_bar(config.data, right, solution, refine)
+
+        return refine, refined
 
     def _outputs(self, split: str, scene: Scene, solution: Solution) -> DataparserOutputs:
         config = self.config
@@ -123,6 +139,9 @@ class KroncDataParser(DataParser):
         points = solution.points[np.isfinite(solution.points).all(-1)]
         world = world_around(points, everyone.c2w[everyone.posed], config.scene_scale, config.scale_factor)
         seeds = grey(points)
+        if solution.cloud is not None:
+            seen = solution.cloud.on_vehicle | (views.masks is None or self.config.background == "keep")
+            seeds += Seeds(solution.cloud.points[seen], solution.cloud.colours[seen])
         if split == "train":  # models start from the training views' metadata
             seeds += self._seeds(views, world.box)
         return DataparserOutputs(

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Annotated, Union
 
+import numpy as np
 import tyro
 from rich.console import Console
 
@@ -27,7 +28,9 @@ from kronc_ns.capture.selection import Sampling
 from kronc_ns.capture.sidecars import check_sidecars, copy_depths, copy_reference
 from kronc_ns.capture.source import Source, find_source
 from kronc_ns.commands.console import exit_on_error, exit_status, progress_bar, report_table, solving
+from kronc_ns.commands.image_options import ImageOptions
 from kronc_ns.commands.options import Flag, SolverOptions
+from kronc_ns.commands.refining import refine_with_bar
 from kronc_ns.errors import KroncError
 from kronc_ns.files.cache import fingerprint
 from kronc_ns.files.keypoints import FORMATS, Detections, read_keypoints, write_keypoints
@@ -88,6 +91,8 @@ class KroncToNerfstudio:
     facebook/dpt-dinov2-base-kitti, downloaded)."""
     solve: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
     """How the poses are solved."""
+    images: Annotated[ImageOptions, tyro.conf.arg(name="")] = field(default_factory=ImageOptions)
+    """How they are refined by features of the images."""
 
     def main(self) -> None:
         """Process, and end the program with the status of what happened (0, 2, 3 or 130)."""
@@ -168,6 +173,10 @@ class KroncToNerfstudio:
         again = ""
         if isinstance(detector, GuidedDetector) and solution.status is not Status.FAILED:
             scene, solution, again = _look_again(detector, scene, solution, config, out)
+        refine = self.images.refine_config(config.refine_focal, config.refine_k1, config.seed)
+        if refine is not None and solution.status is not Status.FAILED and config.solver != "none":
+            right = scene.with_sides_swapped(np.array([view.swapped for view in solution.views]))
+            solution = refine_with_bar(out, right, solution, refine)
         report = write_solution(out, scene, solution, out, fingerprint(scene, config))
 
         table = report_table(report, (*scene.notes, *([note] if note else [])))

@@ -17,7 +17,7 @@ from numba.extending import register_jitable
 # Without nnan and ninf: comparisons with NaN must stay false.
 _FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 _PACKAGE = Path(__file__).resolve().parents[1]
-_COMPILED_FOLDERS = ("solve", "plugin/splat_cpu")
+_COMPILED_FOLDERS = ("solve", "refine", "plugin/splat_cpu")
 
 formula: Callable[[Callable[..., Any]], Callable[..., Any]] = register_jitable
 """Marks plain arithmetic on components: compiled loops inline it, tensors broadcast over it."""

@@ -1,0 +1,77 @@
+"""How sure refined poses are: the sandwich covariance of a joint adjustment, relative to all other cameras."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from kronc_ns.refine.adjustment import sightings
+from kronc_ns.refine.gathering import Gathered
+from kronc_ns.refine.keypoints import KeypointTracks
+from kronc_ns.refine.options import RefineConfig
+from kronc_ns.refine.patches import templates
+from kronc_ns.refine.rig import Rig
+from kronc_ns.refine.tracks import Tracks
+from kronc_ns.solve import bundle
+
+_COMMON_PX = 0.05
+"""What patches of one view that are laid over those of another are off by together: they are seen equally askew. No
+residual shows it, for poses give way to it; measured on rendered walks."""
+
+
+def pose_sigmas(
+    keypoints: KeypointTracks, tracks: Tracks, gathered: Gathered, rig: Rig, sigma_px: float, refine: RefineConfig
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Standard deviations of each view: of the rotation in degrees and of the centre in units of the world, each the
+    root of the summed variances of three axes.
+
+    No common shift, turn or growth of the camera centres counts, as where poses are compared after an alignment.
+    """
+    data, now = sightings(keypoints, tracks, gathered, rig, sigma_px, refine)
+    views = len(rig.rotation)
+    curvature, scores = bundle.sandwich(data, now, _group(keypoints, tracks, gathered, rig), _COMMON_PX)
+    gauge = bundle.gauge_of(now, len(curvature))
+    basis = np.linalg.qr(gauge)[0]
+    inverse = np.linalg.inv(curvature + np.trace(curvature) / len(curvature) * (basis @ basis.T))
+    held = _centres_held(rig, len(curvature))
+    project = np.eye(len(curvature)) - gauge @ np.linalg.solve(held @ gauge, held)
+    half = project @ inverse
+    freedom = 2 * len(data.camera) - 3 * len(now.points) - len(curvature)
+    measured = 2 * len(data.camera) - 3 * len(now.points)
+    covariance = half @ scores @ half.T * (measured / max(freedom, 1))
+    block = np.diagonal(covariance)[: 6 * views].reshape(views, 6)
+    rotation = np.degrees(np.sqrt(np.maximum(block[:, :3].sum(1), 0)))
+    at = 6 * np.arange(views)[:, None] + np.arange(6)
+    own = covariance[at[:, :, None], at[:, None, :]]
+    by_pose = _centre_by_pose(rig)
+    centre = np.trace(by_pose @ own @ by_pose.transpose(0, 2, 1), axis1=1, axis2=2)
+    return rotation, np.sqrt(np.maximum(centre, 0))
+
+
+def _group(keypoints: KeypointTracks, tracks: Tracks, gathered: Gathered, rig: Rig) -> Int[np.ndarray, "s"]:
+    """The sightings that err alike: of one view, laid over templates of one other. Keypoints do not."""
+    template = gathered.view[templates(tracks, gathered, rig)][tracks.of_track]
+    own = gathered.view[tracks.feature]
+    pair = np.where(template == own, -1, template * len(rig.rotation) + own)
+    number = np.unique(pair, return_inverse=True)[1] - int((pair < 0).any())
+    return np.concatenate([np.full(int(keypoints.first[-1]), -1), number]).astype(np.int64)
+
+
+def _centre_by_pose(rig: Rig) -> Float[np.ndarray, "n 3 6"]:
+    """Derivative of each centre, in the world, by turn and shift: with R' = exp(w) R and t' = exp(w) t + v the centre
+    -R'^T t' moves by -R^T v."""
+    derivative = np.zeros((len(rig.rotation), 3, 6))
+    derivative[:, :, 3:] = -rig.rotation.transpose(0, 2, 1)
+    return derivative
+
+
+def _centres_held(rig: Rig, unknowns: int) -> Float[np.ndarray, "7 f"]:
+    """Rows whose products with the unknowns' changes vanish where the centres have no common shift, turn or growth."""
+    centre = rig.cameras.centre
+    arm = centre - centre.mean(0)
+    by_pose = _centre_by_pose(rig)
+    rows = np.zeros((7, unknowns))
+    for n, (r, derivative) in enumerate(zip(arm, by_pose, strict=True)):
+        columns = slice(6 * n, 6 * n + 6)
+        rows[:3, columns] = derivative
+        rows[3:6, columns] = np.cross(r[:, None], derivative, axis=0)
+        rows[6, columns] = r @ derivative
+    return rows
