@@ -88,6 +88,18 @@ def with_noise(subject: Subject, noise_px: float, rng: np.random.Generator) -> S
     return replace(subject, scene=replace(scene, keypoints=keypoints))
 
 
+def with_outliers(subject: Subject, share: float, rng: np.random.Generator) -> Subject:
+    """A share of the detections of each view moved anywhere in the box around them."""
+    scene = subject.scene
+    keypoints = scene.keypoints.copy()
+    for view, seen in enumerate(scene.seen):
+        moved = seen & (rng.random(len(seen)) < share)
+        if moved.any():
+            low, high = keypoints[view, seen, :2].min(0), keypoints[view, seen, :2].max(0)
+            keypoints[view, moved, :2] = rng.uniform(low, high, (int(moved.sum()), 2))
+    return replace(subject, scene=replace(scene, keypoints=keypoints))
+
+
 def thinned(subject: Subject, views: int) -> Subject:
     """So many of the views, evenly spread over a capture in which the first follows the last, as on a lap."""
     if not 3 <= views <= len(subject.truth):

@@ -22,12 +22,12 @@ _MOST_TRAININGS = 4  # at a time, of one thread and about 1.5 GB each
 class Bench:
     """Measure accuracy, speed or view synthesis on synthetic captures, beside what is asked of each row."""
 
-    suite: Literal["poses", "speed", "nvs", "detector", "trust", "fleet"] = "poses"
+    suite: Literal["poses", "speed", "nvs", "detector", "trust", "fleet", "refine"] = "poses"
     """poses: errors beside those of the best that the data allow; speed: time and memory beside other solvers'; nvs:
     radiance fields trained on exact, solved and unsolved poses (CPU, half an hour on two cores); detector: points and
     poses from bare photos of --photos; trust: whether what is said of a solution is so, over captures with every kind
     of trouble (trials from 100,000 on are those that the verdict was tuned on); fleet: `kronc fleet` on Ray nodes of
-    this machine."""
+    this machine; refine: poses from image features, on the rendered captures of --captures and spin_suv of --photos."""
     seeds: int | None = None
     """Number of seeds of every row (default: what the row asks for)."""
     first_seed: int = 0
@@ -42,7 +42,9 @@ class Bench:
     scenes: int = 1000
     """Scenes of the throughput row; of fleet the most captures of a row (at 2,000 all are as asked)."""
     photos: Path | None = None
-    """Of detector: folder with spin_suv, captures, car_parts and cars; rows of what is not there are left out."""
+    """Of detector and refine: folder with spin_suv, captures, car_parts and cars; what it lacks is left out."""
+    captures: Path | None = None
+    """Of refine: folder with rendered captures walk_* and hemi_*, as `kronc synth --render` makes them."""
     detector_weights: Path | None = None
     """Of detector: other weights than the builtin ones."""
     keep: Path | None = None
@@ -92,6 +94,11 @@ class Bench:
                     from kronc_ns.benchmark.suites.fleet import fleet_rows
 
                     rows = fleet_rows(self.scenes)
+                case "refine":
+                    from kronc_ns.benchmark.suites.refine import refine_rows
+
+                    rows, missing = refine_rows(self.captures, self.photos)
+                    print("\n".join(missing), file=sys.stderr)
                 case _:
                     assert_never(self.suite)
             chosen = [row for row in rows if self.rows.lower() in row.name.lower()]

@@ -57,7 +57,7 @@ class Camera:
 
     def undistort(self, uv: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
         """Pixels as an ideal pinhole camera with the same K would see them."""
-        if not any(self.distortion):
+        if not any(self.distortion) or not uv.size:
             return uv
         import cv2  # only lenses with distortion need it
 
@@ -69,7 +69,7 @@ class Camera:
 
     def distort(self, uv: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
         """Pixels of the ideal pinhole camera as this one sees them: the inverse of `undistort`."""
-        if not any(self.distortion):
+        if not any(self.distortion) or not uv.size:
             return uv
         import cv2
 

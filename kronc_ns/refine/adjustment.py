@@ -30,6 +30,8 @@ class Adjusted:
 
     rig: Rig
     tracks: Tracks
+    gathered: Gathered
+    """What the tracks are of."""
     sigma_px: float
     """Noise of the features along one axis."""
     before_px: float
@@ -77,7 +79,7 @@ def adjust(
     found_rig = replace(rig, rotation=u @ vt, translation=now.translation, keypoints=known)
     found_rig = found_rig.with_lenses(*now.intrinsics.T).moved(back)
     points = back.apply(now.points[joints:])
-    return Adjusted(found_rig, replace(tracks, points=points), sigma, before, after)
+    return Adjusted(found_rig, replace(tracks, points=points), gathered, sigma, before, after)
 
 
 def sightings(

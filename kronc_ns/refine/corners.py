@@ -46,14 +46,14 @@ def find_corners(
 
 
 def follow(
-    corners: Float32[np.ndarray, "k 2"], grey: UInt8[np.ndarray, "h w"], others: Sequence[UInt8[np.ndarray, "h w"]]
+    corners: Float32[np.ndarray, "k 2"], grey: UInt8[np.ndarray, "h w"], others: Sequence[UInt8[np.ndarray, "_ _"]]
 ) -> list[Followed]:
     """Corners of a view in each of the others (of its size)."""
     return [_follow(corners, grey, other) for other in others]
 
 
 def _follow(
-    corners: Float32[np.ndarray, "k 2"], grey: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"]
+    corners: Float32[np.ndarray, "k 2"], grey: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "_ _"]
 ) -> Followed:
     if not len(corners) or grey.shape != other.shape:
         return Followed(np.empty((0, 2), np.float32), np.empty(0, int))

@@ -42,7 +42,7 @@ class Gathered:
     colour: UInt8[np.ndarray, "f 3"]
     followed: Linked
     """Corners."""
-    grey: tuple[UInt8[np.ndarray, "h w"], ...]
+    grey: tuple[UInt8[np.ndarray, "_ _"], ...]
     """The photos, no larger than `MOST_PX`."""
 
     @property

@@ -26,8 +26,11 @@ _LEVELS = 4
 _STEPS, _REST_PX = 12, 0.005
 _ALIKE = 0.85  # least correlation of two patches
 _FARTHEST = 1.5  # steps that a feature may be moved by
-_WIDEST_DEG = 90.0  # from the mean direction of those that see a point, within which it may look alike
+_WIDEST_DEG = 60.0  # from the mean direction of those that see a point, within which it may look alike
+_WIDEST_LEVEL_DEG, _LEVEL_M = 90.0, 0.1  # on the ground, whose plane is known, from all around
+_MOST_NEW = 10  # views that a track is looked for in: those that see its point most as the others do
 _EDGE_PX = 4.0
+_AT_ONCE = 50  # groups that a thread does before it hands over
 _LEAST_ALIKE = 0.3  # to begin with
 _BLUR_PX = 0.7
 _FINE = 128  # parts of a grey level: faint features are one or two levels deep
@@ -76,19 +79,24 @@ def _expected(
     mean = np.zeros((len(tracks), 3))
     np.add.at(mean, tracks.of_track, ray)
     mean = unit(mean)
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    level = np.abs(tracks.points[:, 2]) < _LEVEL_M
+    widest = np.cos(np.radians(np.where(level, _WIDEST_LEVEL_DEG, _WIDEST_DEG)))
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     seen = np.zeros((len(tracks), len(centre)), bool)
     seen[tracks.of_track, gathered.view[tracks.feature]] = True
     for view, camera in enumerate(rig.lenses[lens] for lens in rig.lens):
         turned = (unit(tracks.points - centre[view]) * mean).sum(1)
         uv = tracks.points @ rig.rotation[view].T + rig.translation[view]
-        near = np.flatnonzero(~seen[:, view] & (turned > np.cos(np.radians(_WIDEST_DEG))) & (uv[:, 2] > 0.1))
+        near = np.flatnonzero(~seen[:, view] & (turned > widest) & (uv[:, 2] > 0.1))
         plane = uv[near, :2] / uv[near, 2:]
         pixel = camera.distort(plane * (camera.fx, camera.fy) + (camera.cx, camera.cy))
         inside = ((pixel > _EDGE_PX) & (pixel < np.array([camera.width, camera.height]) - _EDGE_PX)).all(1)
-        found.append((near[inside], np.full(int(inside.sum()), view), pixel[inside]))
-    track, view, pixel = (np.concatenate(column) for column in zip(*found, strict=True))
-    return track, view, pixel
+        found.append((near[inside], np.full(int(inside.sum()), view), pixel[inside], turned[near[inside]]))
+    track, view, pixel, turned = (np.concatenate(column) for column in zip(*found, strict=True))
+    order = np.lexsort((-turned, track))
+    begin = np.searchsorted(track[order], track[order])  # of each track's rows
+    kept = np.sort(order[np.arange(len(order)) - begin < _MOST_NEW])
+    return track[kept], view[kept], pixel[kept]
 
 
 def _laid_over(
@@ -111,7 +119,7 @@ def _laid_over(
     groups = _groups(level, of_here, view)
     pyramids = list(side_by_side(_pyramid, gathered.grey))
 
-    def run(rows: Int[np.ndarray, "g"]) -> tuple[Float[np.ndarray, "g 2"], Float[np.ndarray, "g"]]:
+    def overlay(rows: Int[np.ndarray, "g"]) -> tuple[Float[np.ndarray, "g 2"], Float[np.ndarray, "g"]]:
         at, i, j = level[rows[0]], of_here[rows[0]], view[rows[0]]
         scale = 2.0**at
         shift, alike = np.zeros((len(rows), 2)), np.zeros(len(rows))
@@ -128,10 +136,12 @@ def _laid_over(
         return shift * scale, alike
 
     found, fits = pixel.copy(), np.zeros(len(here), bool)
-    for rows, (shift, alike) in zip(groups, side_by_side(run, groups), strict=True):
-        fits[rows] = (alike >= _ALIKE) & (np.linalg.norm(shift, axis=1) <= _FARTHEST * step[rows])
-        good = rows[fits[rows]]
-        found[good] += shift[fits[rows]] / shrink[view[good]][:, None]
+    parts = [groups[i : i + _AT_ONCE] for i in range(0, len(groups), _AT_ONCE)]
+    for some, overlaid in zip(parts, side_by_side(lambda part: [overlay(rows) for rows in part], parts), strict=True):
+        for rows, (shift, alike) in zip(some, overlaid, strict=True):
+            fits[rows] = (alike >= _ALIKE) & (np.linalg.norm(shift, axis=1) <= _FARTHEST * step[rows])
+            good = rows[fits[rows]]
+            found[good] += shift[fits[rows]] / shrink[view[good]][:, None]
     return found, fits
 
 
@@ -164,10 +174,12 @@ def _warps(
     for which, normal in enumerate((facing, level)):
         side = unit(np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])))
         tangent = np.stack([side, np.cross(normal, side)], axis=2)
-        ours, theirs = by_here @ tangent, by_there @ tangent
-        flat = np.abs(np.linalg.det(ours)) < 1e-6 * np.square(ours).sum((1, 2))
-        ours[flat], theirs[flat] = np.eye(2), np.eye(2)
-        warps[:, which] = theirs @ np.linalg.inv(ours)
+        ours, theirs = (np.einsum("kij,kjl->kil", of, tangent) for of in (by_here, by_there))
+        (a, b), (c, d) = ours.transpose(1, 2, 0)
+        determinant = a * d - b * c
+        flat = np.abs(determinant) < 1e-6 * np.square(ours).sum((1, 2))  # seen along the plane
+        back = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2) / np.where(flat, 1.0, determinant)[:, None, None]
+        warps[:, which] = np.where(flat[:, None, None], np.eye(2), np.einsum("kij,kjl->kil", theirs, back))
     return warps
 
 
@@ -188,7 +200,7 @@ def _groups(*keys: Int[np.ndarray, "k"]) -> list[Int[np.ndarray, "g"]]:
     return np.split(order, np.flatnonzero((table[1:] != table[:-1]).any(1)) + 1)
 
 
-def _pyramid(grey: UInt8[np.ndarray, "h w"]) -> Sequence[UInt16[np.ndarray, "h w"]]:
+def _pyramid(grey: UInt8[np.ndarray, "_ _"]) -> Sequence[UInt16[np.ndarray, "_ _"]]:
     """The smoothed picture at 1, 1/2, 1/4, ...; pixel i of a level lies at pixel 2 i of the one below."""
     levels = [cv2.GaussianBlur(grey.astype(np.uint16) * _FINE, (0, 0), _BLUR_PX)]
     while len(levels) < _LEVELS:

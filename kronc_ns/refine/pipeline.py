@@ -31,7 +31,7 @@ from kronc_ns.solution import Cloud, ImageEvidence, Solution, Status, ViewReport
 
 _HELD_OUT = 0.2  # share of the tracks that no fit sees
 _TRACKS_OF_VIEW = 400  # that are enough, once their places are those of patches
-_GROWTHS = 2  # times that tracks are looked for in more views: poses are better by then
+_ROUNDS = 2  # of matching by the poses of features
 _LEAST_VIEWS = 3
 _SOLVED_BY = 20  # features of three views that make a view's pose known
 _SURE_DEG, _SURE_SHARE = 2.0, 0.03  # and its standard deviations, at the most, as in the verdict on keypoints
@@ -43,7 +43,6 @@ class _Found:
 
     adjusted: Adjusted
     evidence: Evidence
-    gathered: Gathered
 
 
 def refine_scene(
@@ -75,7 +74,7 @@ def refine_scene(
     keypoints = keypoint_tracks(scene, solution, views)
     angles = view_angles(start.cameras.centre, np.nanmean(start.keypoints, axis=0))
     pairs = choose_pairs(angles)
-    counter = _Counter(progress, len(views) + 2 * len(pairs))
+    counter = _Counter(progress, len(views) + (1 + _ROUNDS) * len(pairs))
     cameras = [scene.camera_of(view) for view in views.tolist()]
     gathered = gather(pictures, views, cameras, start.rotation[:, :, 2], angles, counter.advance)
     uv = start.ideal(gathered.pixel, gathered.view)
@@ -96,7 +95,7 @@ def refine_scene(
         accepted=not evidence.objection,
         reason=evidence.objection or _praise(evidence),
         tracks_by_length=tuple(np.bincount(tracks.lengths).tolist()),
-        observations=tuple(_per_view(tracks, found.gathered, views, len(scene)).tolist()),
+        observations=tuple(_per_view(tracks, found.adjusted.gathered, views, len(scene)).tolist()),
         held_out=evidence.held,
         held_out_before_px=_known(evidence.held_before_px),
         held_out_after_px=_known(evidence.held_after_px),
@@ -112,32 +111,35 @@ def refine_scene(
 def _found(
     start: Rig, keypoints: KeypointTracks, gathered: Gathered, search: Search, config: RefineConfig
 ) -> _Found | None:
-    """Two rounds of matching and adjusting, the second with places from patches; None without tracks."""
-    tracks = find_tracks(gathered, search, start, keypoints, None)
-    held = np.zeros(len(gathered.view), bool)
+    """Features matched by the keypoints' poses, then by those that they lead to; None without tracks."""
     rng = np.random.default_rng(config.seed)
+    tracks = find_tracks(gathered, search, start, keypoints, None)
     reserved = tracks.chosen(rng.random(len(tracks)) < _HELD_OUT)
+    held = np.zeros(len(gathered.view), bool)
     held[reserved.feature] = True
-    if len(tracks) - len(reserved) < _LEAST_VIEWS:
+    fitted = enough(_without(tracks, held), gathered.view, _TRACKS_OF_VIEW, rng)
+    if not len(fitted):
         return None
-    first = adjust(keypoints, _without(tracks, held), gathered, start, None)
-    tracks = find_tracks(gathered, search, first.rig, keypoints, first)
-    if not len(_without(tracks, held)):
-        return None
-    tracks = enough(tracks, gathered.view, _TRACKS_OF_VIEW, rng)
-    gathered = align(tracks, gathered, first.rig)
-    latest = first
-    for _ in range(_GROWTHS):
-        uv = latest.rig.ideal(gathered.pixel, gathered.view)
-        tracks, _ = place(tracks, uv, gathered.view, latest.rig.cameras, latest.sigma_px)
-        tracks, gathered = grow(tracks, gathered, latest.rig)
-        held = np.pad(held, (0, len(gathered.view) - len(held)))
-        latest = adjust(keypoints, _without(tracks, held), gathered, latest.rig, config)
-    evidence = weigh(reserved, gathered, keypoints, start, latest.rig, latest.sigma_px)
-    uv = latest.rig.ideal(gathered.pixel, gathered.view)
-    placed, _ = place(tracks, uv, gathered.view, latest.rig.cameras, latest.sigma_px)
-    final = adjust(keypoints, placed, gathered, latest.rig, config, latest.sigma_px)
-    return _Found(final, evidence, gathered)
+    latest = adjust(keypoints, fitted, gathered, start, None)
+    for _ in range(_ROUNDS):
+        tracks = find_tracks(gathered, search, latest.rig, keypoints, latest)
+        tracks = enough(tracks, gathered.view, _TRACKS_OF_VIEW, rng)
+        aligned = align(tracks, gathered, latest.rig)
+        tracks = _placed(tracks, aligned, latest)
+        tracks, aligned = grow(tracks, aligned, latest.rig)
+        known = _without(tracks, np.pad(held, (0, len(aligned.view) - len(held))))
+        if not len(known):
+            return None
+        latest = adjust(keypoints, known, aligned, latest.rig, config)
+    evidence = weigh(reserved, aligned, keypoints, start, latest.rig, latest.sigma_px)
+    final = adjust(keypoints, _placed(tracks, aligned, latest), aligned, latest.rig, config, latest.sigma_px)
+    return _Found(final, evidence)
+
+
+def _placed(tracks: Tracks, gathered: Gathered, adjusted: Adjusted) -> Tracks:
+    """Tracks with their points where adjusted cameras see them."""
+    rig = adjusted.rig
+    return place(tracks, rig.ideal(gathered.pixel, gathered.view), gathered.view, rig.cameras, adjusted.sigma_px)[0]
 
 
 def _without(tracks: Tracks, held: Bool[np.ndarray, "f"]) -> Tracks:
@@ -160,7 +162,7 @@ def _taken(
     begin: float,
 ) -> Solution:
     """The solution with the refined poses, in its own world."""
-    adjusted, gathered = found.adjusted, found.gathered
+    adjusted, gathered = found.adjusted, found.adjusted.gathered
     sigma_rot, sigma_centre = pose_sigmas(keypoints, adjusted.tracks, gathered, adjusted.rig, adjusted.sigma_px, config)
     back = frame.inverse
     rig = adjusted.rig.moved(back)

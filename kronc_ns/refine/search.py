@@ -46,7 +46,7 @@ def find_tracks(
     data, now = sightings(
         keypoints,
         adjusted.tracks if adjusted else None,
-        gathered if adjusted else None,
+        adjusted.gathered if adjusted else None,
         rig,
         adjusted.sigma_px if adjusted else 1.0,
     )

@@ -108,9 +108,8 @@ def link(matches: Linked, view: Int[np.ndarray, "f"]) -> Tracks:
     strict[np.concatenate([here[matches.strict], there[matches.strict]])] = True
     sorting = np.lexsort((view[used], root))
     feature, track = used[sorting], np.unique(root[sorting], return_inverse=True)[1]
-    length = np.bincount(track) if len(track) else np.zeros(0, int)
-    keep = (length[track] >= 3) | ((length[track] == 2) & strict[sorting])
-    return rows_of(feature[keep], track[keep], np.full((len(length), 3), np.nan))
+    keep = _believed(track, strict[sorting])[track]
+    return rows_of(feature[keep], track[keep], np.full((int(track.max(initial=-1)) + 1, 3), np.nan))
 
 
 def enough(tracks: Tracks, view: Int[np.ndarray, "f"], least: int, rng: np.random.Generator) -> Tracks:
@@ -148,10 +147,15 @@ def place(
 
 def pruned(tracks: Tracks, keep: Bool[np.ndarray, "s"], strict: Bool[np.ndarray, "f"]) -> Tracks:
     """Tracks without some of their sightings; what is left must be of three views, or of two and strict."""
-    kept = np.bincount(tracks.of_track[keep], minlength=len(tracks))
-    enough = (kept[tracks.of_track] >= 3) | ((kept[tracks.of_track] == 2) & strict[tracks.feature])
-    keep = keep & enough
-    return rows_of(tracks.feature[keep], tracks.of_track[keep], tracks.points)
+    feature, track = tracks.feature[keep], tracks.of_track[keep]
+    believed = _believed(track, strict[feature])[track]
+    return rows_of(feature[believed], track[believed], tracks.points)
+
+
+def _believed(track: Int[np.ndarray, "s"], strict: Bool[np.ndarray, "s"]) -> Bool[np.ndarray, "p"]:
+    """Tracks of three views, or of two that are both strict."""
+    length, sure = np.bincount(track), np.bincount(track, weights=strict)
+    return (length >= 3) | ((length == 2) & (sure == 2))
 
 
 def angles_deg(tracks: Tracks, view: Int[np.ndarray, "f"], cameras: Cameras) -> Float[np.ndarray, "p"]:
