@@ -1,6 +1,8 @@
 """features.npz beside a solution: the points of image features and where they were seen."""
 
+import zlib
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -37,7 +39,16 @@ def read_cloud(folder: Path, views: int) -> Cloud | None:
     try:
         with np.load(file, allow_pickle=False) as content:
             found = {name: content[name] for name in _KINDS}
-    except (OSError, ValueError, KeyError, EOFError, AttributeError, NotImplementedError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        EOFError,
+        AttributeError,
+        NotImplementedError,
+        BadZipFile,
+        zlib.error,
+    ) as error:
         raise KroncError(f"{file} cannot be read ({error!r:.100}): refine again, or delete it") from None
     points, sightings = len(found["points"]), len(found["view"])
     shapes = {

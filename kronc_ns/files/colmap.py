@@ -51,7 +51,7 @@ def write_colmap(folder: Path, solved: Path) -> int:
         image = pycolmap.Image(name=Path(frame["file_path"]).name, camera_id=numbers[camera], image_id=number)
         if cloud is not None and frame["file_path"] in names:
             own = np.flatnonzero(cloud.view == names[frame["file_path"]])
-            image.points2D = [pycolmap.Point2D(pixel) for pixel in cloud.pixel[own]]
+            image.points2D = [pycolmap.Point2D(pixel) for pixel in cloud.pixel[own]]  # pyright: ignore[reportAttributeAccessIssue]
             place[own], image_of[own] = np.arange(len(own)), number
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(w2c))
     for point in solved_points(solved):

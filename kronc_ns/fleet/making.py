@@ -88,7 +88,7 @@ def make_data_set(data: Path, out: Path, job: Job, options: FleetOptions) -> dic
     known = {f.name for f in fields(KroncToNerfstudio)}
     same = {f.name: getattr(options, f.name) for f in fields(options) if f.name in known}
     segmentation = SegmenterOptions(options.segmenter, options.segmenter_weights)
-    process = KroncToNerfstudio(data, out, **same, segmentation=segmentation, solve=options)
+    process = KroncToNerfstudio(data, out, **same, segmentation=segmentation, solve=options, images=options)
     with _quietly(job):
         process.run()
     if not (out / "kronc.json").exists():

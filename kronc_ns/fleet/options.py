@@ -8,6 +8,7 @@ from typing import Annotated, Literal, TypeAlias
 import tyro
 
 from kronc_ns.capture.detection.choice import DetectorOptions
+from kronc_ns.commands.image_options import ImageOptions
 from kronc_ns.commands.options import Flag, SolverOptions
 from kronc_ns.errors import KroncError
 
@@ -16,7 +17,7 @@ SegmenterName: TypeAlias = Literal["maskrcnn", "mask2former", "saliency"]
 
 
 @dataclass(kw_only=True)
-class FleetOptions(SolverOptions):
+class FleetOptions(SolverOptions, ImageOptions):
     """How each capture is done, and what it may take."""
 
     poses_only: Flag = False

@@ -60,8 +60,9 @@ def _follow(
     window = (_WINDOW_PX, _WINDOW_PX)
     until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 0.005)
     start = corners[:, None]
-    there, found, _ = cv2.calcOpticalFlowPyrLK(grey, other, start, None, None, None, window, _LEVELS, until)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(other, grey, there, None, None, None, window, _LEVELS, until)
+    options = {"winSize": window, "maxLevel": _LEVELS, "criteria": until}
+    there, found, _ = cv2.calcOpticalFlowPyrLK(grey, other, start, np.empty_like(start), **options)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(other, grey, there, np.empty_like(start), **options)
     same = np.linalg.norm(back - start, axis=2)[:, 0] < _BACK_PX
     moved = np.linalg.norm(there - start, axis=2)[:, 0] > _STILL_PX
     kept = np.flatnonzero((found[:, 0] > 0) & (returned[:, 0] > 0) & same & moved)

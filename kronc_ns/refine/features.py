@@ -35,7 +35,7 @@ def find_features(picture: Picture, camera: Camera, up: Float[np.ndarray, "3"], 
     """The strongest features of a photo; ``up`` is the world's z axis in the camera's axes."""
     grey = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY)
     # without precise upscaling all features are a quarter of a pixel off
-    sift = cv2.SIFT_create(most, contrastThreshold=_CONTRAST, edgeThreshold=_EDGE, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, edgeThreshold=_EDGE, enable_precise_upscale=True)
     found = sift.detect(grey, None)
     places = np.array([(*point.pt, point.size) for point in found]).reshape(-1, 3)
     # SIFT reports a place once for each of its orientations, of which none is needed

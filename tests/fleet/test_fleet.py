@@ -209,7 +209,7 @@ def test_every_option_of_process_data_is_there():
 
     theirs = {f.name: f for f in fields(KroncToNerfstudio)}
     of_one_capture = {"data", "output_dir", "keypoints", "masks"}
-    apart = {"segmentation", "solve"}
+    apart = {"segmentation", "solve", "images"}
     ours = {f.name: f for f in fields(FleetOptions)}
     assert theirs.keys() - ours.keys() == of_one_capture | apart
     for name in theirs.keys() & ours.keys() - {"detection"}:

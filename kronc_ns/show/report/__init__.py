@@ -19,7 +19,7 @@ from kronc_ns.scene import Scene
 from kronc_ns.show.report import figures
 from kronc_ns.show.report.overlays import choose_views, overlay
 from kronc_ns.show.report.templates import render, source
-from kronc_ns.solution import Solution, Status, ViewStatus
+from kronc_ns.solution import ImageEvidence, Solution, Status, ViewStatus
 
 _VERDICT = {
     Status.CONVERGED: "the poses can be trusted",
@@ -60,6 +60,7 @@ def _page(record: dict[str, Any], scene: Scene, solution: Solution, folder: Path
         solution=solution,
         verdict=_VERDICT[solution.status],
         facts=_facts(scene, solution),
+        image_facts=_image_facts(solution.images),
         left_out=_left_out(scene, solution, error, inlier),
         overlays=overlays,
         without_image=sum(not shown.image for shown in overlays),
@@ -102,6 +103,36 @@ def _facts(scene: Scene, solution: Solution) -> list[tuple[str, str, str]]:
             f"from {solution.init} poses, {solution.iterations} steps, {solution.seconds:.2f} s",
         ),
     ]
+
+
+def _image_facts(said: ImageEvidence | None) -> list[tuple[str, str]]:
+    """What image features said, in words."""
+    if said is None:
+        return []
+    tracks = [f"{count} of {length}" for length, count in enumerate(said.tracks_by_length) if count and length < 8]
+    longer = sum(said.tracks_by_length[8:])
+    seen = [count for count in said.observations if count]
+    facts = [
+        ("features were used", "on the vehicle alone" if said.region == "vehicle" else "in the whole frame"),
+        ("background", "stands still while the car turns" if said.background_still else "moves as the car does"),
+        ("tracks, by the views that see them", ", ".join([*tracks, *([f"{longer} of 8 or more"] if longer else [])])),
+        ("sightings of a view", f"median {statistics.median(seen):.0f}, least {min(seen)}" if seen else "none"),
+        ("tracks held out", str(said.held_out)),
+        (
+            "their residual, before and after",
+            f"{_or_unknown(said.held_out_before_px)}, {_or_unknown(said.held_out_after_px)}",
+        ),
+        ("they are met better by", f"{said.held_out_z:.1f} standard deviations"),
+        ("keypoints' chi-square", f"{said.keypoints_z:+.1f} standard deviations off what is expected"),
+        ("noise of a feature", _or_unknown(said.noise_px)),
+        ("focal length, before and after", f"{said.focal_before_px:.2f} px, {said.focal_after_px:.2f} px"),
+        ("time", f"{said.seconds:.1f} s"),
+    ]
+    return [(what, value) for what, value in facts if value]
+
+
+def _or_unknown(value: float | None) -> str:
+    return "unknown" if value is None else _px(value)
 
 
 def _focal(solution: Solution) -> tuple[str, str, str]:
