@@ -14,6 +14,7 @@ from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.tracks import Tracks
 from kronc_ns.solve import bundle
 from kronc_ns.solve.robust import RAYLEIGH_MEDIAN
+from kronc_ns.solve.sightings import Sightings, Unknowns
 
 _FIRST_SIGMA_PX, _LEAST_SIGMA_PX = 0.5, 0.02  # of a feature's place
 _PAIR_FACTOR = 1.5  # tracks of two views, which nothing confirms, are believed less
@@ -89,7 +90,7 @@ def sightings(
     rig: Rig,
     sigma_px: float,
     refine: RefineConfig | None = None,
-) -> tuple[bundle.Sightings, bundle.Unknowns]:
+) -> tuple[Sightings, Unknowns]:
     """What is adjusted, and where it begins: the keypoints first, then the tracks, if there are any."""
     first, view = keypoints.first, keypoints.view
     uv = rig.ideal(keypoints.pixel, keypoints.view)
@@ -103,7 +104,7 @@ def sightings(
         noise = _noise(tracks, gathered, rig, sigma_px)
         weight, scale = np.concatenate([weight, noise**-2.0]), np.concatenate([scale, noise])
         points = np.concatenate([points, tracks.points])
-    data = bundle.Sightings(
+    data = Sightings(
         first.astype(np.int64),
         view.astype(np.int64),
         uv,
@@ -114,7 +115,7 @@ def sightings(
         refine is not None and refine.refine_focal,
         refine is not None and refine.refine_k1,
     )
-    return data, bundle.Unknowns(rig.rotation, rig.translation, points, np.zeros((len(rig.lenses), 2)))
+    return data, Unknowns(rig.rotation, rig.translation, points, np.zeros((len(rig.lenses), 2)))
 
 
 def _noise(tracks: Tracks, gathered: Gathered, rig: Rig, sigma_px: float) -> Float[np.ndarray, "s"]:
@@ -124,8 +125,8 @@ def _noise(tracks: Tracks, gathered: Gathered, rig: Rig, sigma_px: float) -> Flo
 
 
 def _with_noise(
-    data: bundle.Sightings, tracks: Tracks, own: slice, gathered: Gathered, rig: Rig, sigma_px: float
-) -> bundle.Sightings:
+    data: Sightings, tracks: Tracks, own: slice, gathered: Gathered, rig: Rig, sigma_px: float
+) -> Sightings:
     """With another noise of the features."""
     noise = _noise(tracks, gathered, rig, sigma_px)
     weight, scale = data.weight.copy(), data.scale.copy()

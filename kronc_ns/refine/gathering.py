@@ -1,6 +1,7 @@
 """All features of all views in a row, and the corners followed between neighbours."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,7 +17,9 @@ from kronc_ns.solve.threads import side_by_side
 
 MOST_PX = 1280
 """Larger photos are made smaller: their finest detail is noise."""
-_FEATURES, _LEAST_OF_VIEW, _MOST_OF_VIEW = 150_000, 2_000, 4_000
+_SIFT_PX = 640
+"""SIFT doubles photos before it looks; where features are exactly is found later, in the larger pictures."""
+_FEATURES, _LEAST_OF_VIEW, _MOST_OF_VIEW = 100_000, 1_500, 4_000
 """Of all views together; of each."""
 _NEIGHBOURS, _NEIGHBOURS_DEG = 2, 35.0  # that corners are followed to
 _CORNER_SIMILARITY, _CORNER_RATIO = 0.93, 0.5  # what a followed corner is worth beside a match of descriptors
@@ -82,9 +85,10 @@ def gather(
     """
     most = min(max(_FEATURES // len(views), _LEAST_OF_VIEW), _MOST_OF_VIEW)
     looked = []
-    for one in side_by_side(lambda i: _look(pictures(int(views[i])), cameras[i], up[i], most), range(len(views))):
-        looked.append(one)
-        advance()
+    with _one_thread_each():
+        for one in side_by_side(lambda i: _look(pictures(int(views[i])), cameras[i], up[i], most), range(len(views))):
+            looked.append(one)
+            advance()
     features = [one.features for one in looked]
     first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
     sift = Gathered(
@@ -101,21 +105,33 @@ def gather(
     return _with_corners(sift, looked, angles)
 
 
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """OpenCV's own threads would only get in the way of ours."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
 def _look(picture: Picture, camera: Camera, up: Float[np.ndarray, "3"], most: int) -> _Looked:
-    picture, factor = _reduced(picture)
-    found = find_features(picture, camera.scaled(factor), up, most)
-    found = replace(found, pixel=found.pixel / factor, size=found.size / factor)
+    small, shrunk = _reduced(picture, _SIFT_PX)
+    found = find_features(small, camera.scaled(shrunk), up, most)
+    found = replace(found, pixel=found.pixel / shrunk, size=found.size / shrunk)
+    picture, factor = _reduced(picture, MOST_PX)
     grey = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY)
     corners = find_corners(smoothed(grey), picture.vehicle)
     return _Looked(found, corners, under(picture.rgb, corners + 0.5), grey, factor, picture.vehicle is not None)
 
 
-def _reduced(picture: Picture) -> tuple[Picture, float]:
-    """The picture, no larger than `MOST_PX`, and the factor of its size."""
+def _reduced(picture: Picture, most_px: int) -> tuple[Picture, float]:
+    """The picture, no larger than ``most_px``, and the factor of its size."""
     height, width = picture.rgb.shape[:2]
-    if max(height, width) <= MOST_PX:
+    if max(height, width) <= most_px:
         return picture, 1.0
-    factor = MOST_PX / max(height, width)
+    factor = most_px / max(height, width)
     size = (round(width * factor), round(height * factor))
     vehicle = picture.vehicle
     if vehicle is not None:

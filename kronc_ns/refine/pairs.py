@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from kronc_ns.geometry.poses import unit
 from kronc_ns.geometry.rotations import skew
 from kronc_ns.solve import bundle
+from kronc_ns.solve.sightings import Sightings, Unknowns, gauge_of
 
 _NEAREST = 8  # of a view: those seen from the nearest directions ...
 _WITHIN_DEG = 45.0  # ... but for these angles, past which features look different
@@ -43,15 +44,13 @@ def choose_pairs(angles: Float[np.ndarray, "n n"]) -> Int[np.ndarray, "p 2"]:
     return np.unique(pairs, axis=0)
 
 
-def joint_covariance(
-    data: bundle.Sightings, now: bundle.Unknowns, distance: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "f f"]:
+def joint_covariance(data: Sightings, now: Unknowns, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "f f"]:
     """Of all reduced unknowns together, in some gauge; views that nothing is known of get what can be believed.
 
     ``distance`` is that of each camera from the car.
     """
     matrix = bundle.normal_matrix(data, now)
-    gauge = np.linalg.qr(bundle.gauge_of(now, len(matrix)))[0]
+    gauge = np.linalg.qr(gauge_of(now, len(matrix)))[0]
     matrix += np.trace(matrix) / len(matrix) * (gauge @ gauge.T)
     loose = np.repeat([[_LOOSE_RAD, _LOOSE_SHARE]], len(distance), axis=0) * np.stack(
         [np.ones_like(distance), distance], axis=1
@@ -63,7 +62,7 @@ def joint_covariance(
 
 def epipolar_bands(
     pairs: Int[np.ndarray, "p 2"],
-    now: bundle.Unknowns,
+    now: Unknowns,
     covariance: Float[np.ndarray, "f f"],
     middle: Float[np.ndarray, "3"],
     focal: float,
@@ -84,7 +83,7 @@ def epipolar_bands(
 
 def _across(
     pairs: Int[np.ndarray, "p 2"],
-    now: bundle.Unknowns,
+    now: Unknowns,
     covariance: Float[np.ndarray, "f f"],
     world: Float[np.ndarray, "p 3"],
     focal: float,

@@ -18,6 +18,7 @@ from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.tracks import Tracks, rows_of
 from kronc_ns.solve.compiled import compiled
+from kronc_ns.solve.linear import solve
 from kronc_ns.solve.threads import side_by_side
 
 _RADIUS = 7  # samples on each side of the middle
@@ -233,33 +234,6 @@ def _patch(image: Any, at: Any, a: Any, dx: float, dy: float, x: Any, y: Any, ou
 
 
 @compiled
-def _solve(m: Any, b: Any) -> Any:
-    """Solution of a positive definite system in place of ``b``; False where it is none."""
-    size = len(b)
-    for j in range(size):
-        total = m[j, j]
-        for k in range(j):
-            total -= m[j, k] * m[j, k]
-        if not total > 1e-12:
-            return False
-        m[j, j] = np.sqrt(total)
-        for i in range(j + 1, size):
-            total = m[i, j]
-            for k in range(j):
-                total -= m[i, k] * m[j, k]
-            m[i, j] = total / m[j, j]
-    for i in range(size):
-        for k in range(i):
-            b[i] -= m[i, k] * b[k]
-        b[i] /= m[i, i]
-    for i in range(size - 1, -1, -1):
-        b[i] /= m[i, i]
-        for k in range(i):
-            b[k] -= m[i, k] * b[i]
-    return True
-
-
-@compiled
 def _correlation(template: Any, patch: Any, weight: Any) -> Any:
     """Of two patches, -1 to 1."""
     total = a = b = 0.0
@@ -370,7 +344,7 @@ def _align(here: Any, there: Any, at_here: Any, at_there: Any, warps: Any, step:
                     total += weight[k] * rows[p, k] * patch[k]
                 right[p] = total / gain
             matrix[:] = normal
-            if not _solve(matrix, right):
+            if not solve(matrix, right):
                 sound = False
                 break
             # the warp after the inverse of the step

@@ -31,7 +31,8 @@ from kronc_ns.solution import Cloud, ImageEvidence, Solution, Status, ViewReport
 
 _HELD_OUT = 0.2  # share of the tracks that no fit sees
 _TRACKS_OF_VIEW = 400  # that are enough, once their places are those of patches
-_ROUNDS = 2  # of matching by the poses of features
+_ROUNDS = 2  # of matching by the poses of features, at the most ...
+_MATCHED_WELL = 0.75  # ... for one is enough where its matches met the poses that made them nearly as well as its own
 _LEAST_VIEWS = 3
 _SOLVED_BY = 20  # features of three views that make a view's pose known
 _SURE_DEG, _SURE_SHARE = 2.0, 0.03  # and its standard deviations, at the most, as in the verdict on keypoints
@@ -131,6 +132,8 @@ def _found(
         if not len(known):
             return None
         latest = adjust(keypoints, known, aligned, latest.rig, config)
+        if latest.after_px > _MATCHED_WELL * latest.before_px:
+            break
     evidence = weigh(reserved, aligned, keypoints, start, latest.rig, latest.sigma_px)
     final = adjust(keypoints, _placed(tracks, aligned, latest), aligned, latest.rig, config, latest.sigma_px)
     return _Found(final, evidence)

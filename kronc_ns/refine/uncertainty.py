@@ -10,7 +10,8 @@ from kronc_ns.refine.options import RefineConfig
 from kronc_ns.refine.patches import templates
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.tracks import Tracks
-from kronc_ns.solve import bundle
+from kronc_ns.solve.sandwich import sandwich
+from kronc_ns.solve.sightings import gauge_of
 
 _COMMON_PX = 0.05
 """What patches of one view that are laid over those of another are off by together: they are seen equally askew. No
@@ -27,8 +28,8 @@ def pose_sigmas(
     """
     data, now = sightings(keypoints, tracks, gathered, rig, sigma_px, refine)
     views = len(rig.rotation)
-    curvature, scores = bundle.sandwich(data, now, _group(keypoints, tracks, gathered, rig), _COMMON_PX)
-    gauge = bundle.gauge_of(now, len(curvature))
+    curvature, scores = sandwich(data, now, _group(keypoints, tracks, gathered, rig), _COMMON_PX)
+    gauge = gauge_of(now, len(curvature))
     basis = np.linalg.qr(gauge)[0]
     inverse = np.linalg.inv(curvature + np.trace(curvature) / len(curvature) * (basis @ basis.T))
     held = _centres_held(rig, len(curvature))
