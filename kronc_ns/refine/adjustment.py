@@ -11,13 +11,14 @@ from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.keypoints import KeypointTracks
 from kronc_ns.refine.options import RefineConfig
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import Tracks
+from kronc_ns.refine.tracks import Tracks, angles_off_middle_deg
 from kronc_ns.solve import bundle
 from kronc_ns.solve.robust import RAYLEIGH_MEDIAN
 from kronc_ns.solve.sightings import Sightings, Unknowns
 
 _FIRST_SIGMA_PX, _LEAST_SIGMA_PX = 0.5, 0.02  # of a feature's place
 _PAIR_FACTOR = 1.5  # tracks of two views, which nothing confirms, are believed less
+_ASKEW_DEG = 8.0  # from the middle of the views of a point, where a patch seen askew has doubled its variance
 _ROUNDS, _SETTLED = 4, 0.93  # of the noise's estimate
 _STEPS, _TOLERANCE = 6, 1e-3
 _SETTLING_STEPS, _SETTLING_TOLERANCE = 15, 1e-5
@@ -119,9 +120,14 @@ def sightings(
 
 
 def _noise(tracks: Tracks, gathered: Gathered, rig: Rig, sigma_px: float) -> Float[np.ndarray, "s"]:
-    """Standard deviation of each sighting in ideal pixels."""
+    """Standard deviation of each sighting in ideal pixels.
+
+    It grows with the angle a point is seen askew by: patches of what is no plane are then off, those of one surface all
+    to the same side, which neither the loss nor their number makes good.
+    """
     of_pair = np.where(tracks.lengths == 2, _PAIR_FACTOR, 1.0)[tracks.of_track]
-    return sigma_px * of_pair / rig.enlargement[gathered.view[tracks.feature]]
+    askew = np.hypot(1.0, angles_off_middle_deg(tracks, gathered.view, rig.cameras) / _ASKEW_DEG)
+    return sigma_px * of_pair * askew / rig.enlargement[gathered.view[tracks.feature]]
 
 
 def _with_noise(

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from kronc_ns.geometry.poses import unit
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import Tracks, rows_of
+from kronc_ns.refine.tracks import Tracks, angles_off_middle_deg, rays, rows_of
 from kronc_ns.solve.compiled import compiled
 from kronc_ns.solve.linear import solve
 from kronc_ns.solve.threads import side_by_side
@@ -76,10 +76,7 @@ def _expected(
     """Track, view and photographed pixel of sightings that are missing: of points that face a view as they face those
     that see them."""
     centre = rig.cameras.centre
-    ray = unit(tracks.points[tracks.of_track] - centre[gathered.view[tracks.feature]])
-    mean = np.zeros((len(tracks), 3))
-    np.add.at(mean, tracks.of_track, ray)
-    mean = unit(mean)
+    _, mean = rays(tracks, gathered.view, rig.cameras)
     level = np.abs(tracks.points[:, 2]) < _LEVEL_M
     widest = np.cos(np.radians(np.where(level, _WIDEST_LEVEL_DEG, _WIDEST_DEG)))
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
@@ -153,12 +150,7 @@ def _size(gathered: Gathered) -> Float[np.ndarray, "f"]:
 
 def templates(tracks: Tracks, gathered: Gathered, rig: Rig) -> Int[np.ndarray, "p"]:
     """The feature of each track that the others are aligned to: seen from the middle of all directions."""
-    centre = rig.cameras.centre[gathered.view[tracks.feature]]
-    ray = unit(tracks.points[tracks.of_track] - centre)
-    mean = np.zeros((len(tracks), 3))
-    np.add.at(mean, tracks.of_track, ray)
-    off = 1.0 - (ray * unit(mean)[tracks.of_track]).sum(1)
-    order = np.lexsort((off, tracks.of_track))
+    order = np.lexsort((angles_off_middle_deg(tracks, gathered.view, rig.cameras), tracks.of_track))
     return tracks.feature[order[tracks.first[:-1]]]
 
 

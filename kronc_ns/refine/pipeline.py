@@ -23,7 +23,7 @@ from kronc_ns.refine.pictures import Pictures
 from kronc_ns.refine.region import background_is_still, vehicle_features
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.search import Search, find_tracks, standing_features
-from kronc_ns.refine.tracks import Tracks, enough, place
+from kronc_ns.refine.tracks import Tracks, confirmed, enough, place
 from kronc_ns.refine.uncertainty import pose_sigmas
 from kronc_ns.refine.verdict import Evidence, weigh
 from kronc_ns.scene import Scene
@@ -31,6 +31,7 @@ from kronc_ns.solution import Cloud, ImageEvidence, Solution, Status, ViewReport
 
 _HELD_OUT = 0.2  # share of the tracks that no fit sees
 _TRACKS_OF_VIEW = 400  # that are enough, once their places are those of patches
+_PAIRED = 20  # sightings of a view in tracks of three, below which its tracks of two count
 _ROUNDS = 2  # of matching by the poses of features, at the most ...
 _MATCHED_WELL = 0.75  # ... for one is enough where its matches met the poses that made them nearly as well as its own
 _LEAST_VIEWS = 3
@@ -118,7 +119,8 @@ def _found(
     reserved = tracks.chosen(rng.random(len(tracks)) < _HELD_OUT)
     held = np.zeros(len(gathered.view), bool)
     held[reserved.feature] = True
-    fitted = enough(_without(tracks, held), gathered.view, _TRACKS_OF_VIEW, rng)
+    fitted = confirmed(_without(tracks, held), gathered.view, _PAIRED)
+    fitted = enough(fitted, gathered.view, _TRACKS_OF_VIEW, rng)
     if not len(fitted):
         return None
     latest = adjust(keypoints, fitted, gathered, start, None)
@@ -128,6 +130,7 @@ def _found(
         aligned = align(tracks, gathered, latest.rig)
         tracks = _placed(tracks, aligned, latest)
         tracks, aligned = grow(tracks, aligned, latest.rig)
+        tracks = confirmed(tracks, aligned.view, _PAIRED)
         known = _without(tracks, np.pad(held, (0, len(aligned.view) - len(held))))
         if not len(known):
             return None

@@ -115,7 +115,20 @@ def link(matches: Linked, view: Int[np.ndarray, "f"]) -> Tracks:
 def enough(tracks: Tracks, view: Int[np.ndarray, "f"], least: int, rng: np.random.Generator) -> Tracks:
     """So many of the tracks that every view has ``least`` of them, if it had so many: the longest come first."""
     order = np.lexsort((rng.random(len(tracks)), -tracks.lengths))
-    return tracks.chosen(_enough(tracks.first, view[tracks.feature], order, least, int(view.max(initial=0)) + 1))
+    seen = np.zeros(int(view.max(initial=0)) + 1, np.int64)
+    return tracks.chosen(_enough(tracks.first, view[tracks.feature], order, seen, least))
+
+
+def confirmed(tracks: Tracks, view: Int[np.ndarray, "f"], least: int) -> Tracks:
+    """Those of three views; and of two, until every view has ``least``, where it has fewer of three.
+
+    Nothing but nearness to the line of the very poses that it was found by speaks for a match of two views: it pulls
+    them back to where they were.
+    """
+    long = tracks.lengths >= 3
+    seen = np.bincount(view[tracks.chosen(long).feature], minlength=int(view.max(initial=0)) + 1)
+    pairs = _enough(tracks.first, view[tracks.feature], np.flatnonzero(~long), seen, least)
+    return tracks.chosen(long | pairs)
 
 
 def place(
@@ -158,21 +171,32 @@ def _believed(track: Int[np.ndarray, "s"], strict: Bool[np.ndarray, "s"]) -> Boo
     return (length >= 3) | ((length == 2) & (sure == 2))
 
 
+def rays(
+    tracks: Tracks, view: Int[np.ndarray, "f"], cameras: Cameras
+) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "p 3"]]:
+    """Directions in which each sighting sees its point, and the mean direction of each track."""
+    ray = unit(tracks.points[tracks.of_track] - cameras.centre[view[tracks.feature]])
+    mean = np.stack([np.bincount(tracks.of_track, weights=axis, minlength=len(tracks)) for axis in ray.T], axis=1)
+    return ray, unit(mean)
+
+
+def angles_off_middle_deg(tracks: Tracks, view: Int[np.ndarray, "f"], cameras: Cameras) -> Float[np.ndarray, "s"]:
+    """Between each sighting's ray and the mean of its track's."""
+    ray, mean = rays(tracks, view, cameras)
+    return np.degrees(np.arccos(np.clip((ray * mean[tracks.of_track]).sum(1), -1.0, 1.0)))
+
+
 def angles_deg(tracks: Tracks, view: Int[np.ndarray, "f"], cameras: Cameras) -> Float[np.ndarray, "p"]:
     """Between the rays of each track, at the most: twice the largest from their mean."""
-    ray = unit(tracks.points[tracks.of_track] - cameras.centre[view[tracks.feature]])
-    mean = np.zeros((len(tracks), 3))
-    np.add.at(mean, tracks.of_track, ray)
-    off = np.degrees(np.arccos(np.clip((ray * unit(mean)[tracks.of_track]).sum(1), -1.0, 1.0)))
     widest = np.zeros(len(tracks))
-    np.maximum.at(widest, tracks.of_track, off)
+    np.maximum.at(widest, tracks.of_track, angles_off_middle_deg(tracks, view, cameras))
     return 2 * widest
 
 
 @compiled
-def _enough(first: Any, view: Any, order: Any, least: int, views: int) -> Any:
-    """Which tracks are taken: those that some of their views still wants."""
-    taken, count = np.zeros(len(first) - 1, np.bool_), np.zeros(views, np.int64)
+def _enough(first: Any, view: Any, order: Any, count: Any, least: int) -> Any:
+    """Which tracks are taken: those that some of their views still wants, which has ``count`` so far."""
+    taken = np.zeros(len(first) - 1, np.bool_)
     for p in order:
         wanted = False
         for o in range(first[p], first[p + 1]):

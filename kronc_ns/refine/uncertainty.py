@@ -13,7 +13,7 @@ from kronc_ns.refine.tracks import Tracks
 from kronc_ns.solve.sandwich import sandwich
 from kronc_ns.solve.sightings import gauge_of
 
-_COMMON_PX = 0.05
+_COMMON_PX = 0.03
 """What patches of one view that are laid over those of another are off by together: they are seen equally askew. No
 residual shows it, for poses give way to it; measured on rendered walks."""
 
