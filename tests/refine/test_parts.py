@@ -4,12 +4,25 @@ import cv2
 import numpy as np
 import pytest
 
+from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.rotations import so3_exp
+from kronc_ns.refine.gathering import _look
 from kronc_ns.refine.grid import grid_of
 from kronc_ns.refine.matching import Seen, match, standing_still
 from kronc_ns.refine.pairs import choose_pairs, view_angles
 from kronc_ns.refine.patches import _align
-from kronc_ns.refine.tracks import Cameras, Linked, enough, link, place, rows_of
+from kronc_ns.refine.pictures import Picture
+from kronc_ns.refine.tracks import (
+    Cameras,
+    Linked,
+    angles_deg,
+    angles_off_middle_deg,
+    confirmed,
+    enough,
+    link,
+    place,
+    rows_of,
+)
 from kronc_ns.refine.verdict import _signed_rank_z
 
 FOCAL = 500.0
@@ -107,6 +120,35 @@ def test_enough_tracks_serve_every_view():
     chosen = enough(tracks, view, 50, rng)
     assert (np.bincount(view[chosen.feature], minlength=4) >= 50).all()
     assert len(chosen) == 50
+
+
+def test_tracks_of_two_views_count_where_there_are_few_others():
+    view = np.array([0, 1, 2] * 5 + [0, 1] * 10 + [2, 3] * 10)
+    track = np.repeat(np.arange(25), [3] * 5 + [2] * 20)
+    tracks = rows_of(np.arange(len(view)), track, np.zeros((25, 3)))
+    kept = confirmed(tracks, view, 4)
+    assert (kept.lengths == 3).sum() == 5
+    np.testing.assert_array_equal(np.bincount(view[kept.feature], minlength=4), [5, 5, 5 + 4, 4])
+
+
+def test_a_large_photo_has_its_features_where_they_were_photographed():
+    rgb = np.full((1500, 2000, 3), 90, np.uint8)
+    places = np.random.default_rng(8).uniform(100, 1400, (30, 2))
+    for x, y in places:
+        cv2.circle(rgb, (round(16 * x) - 8, round(16 * y) - 8), 16 * 14, (230, 230, 230), -1, cv2.LINE_AA, 4)
+    camera = Camera(2000.0, 2000.0, 1000.0, 750.0, 2000, 1500)
+    looked = _look(Picture(rgb, None), camera, np.array([0.0, -1.0, 0.0]), 500)
+    off = np.linalg.norm(looked.features.pixel[:, None] - places[None], axis=2).min(0)
+    assert np.median(off) < 0.5
+    assert looked.grey.shape == (960, 1280)
+
+
+def test_angles_are_from_the_middle_of_the_views():
+    centre = np.array([[np.sin(a), 0.0, -np.cos(a)] for a in np.radians([-20.0, 0.0, 20.0])])
+    cameras = Cameras(np.tile(np.eye(3), (3, 1, 1)), -centre, 500.0)
+    tracks = rows_of(np.arange(3), np.zeros(3, int), np.zeros((1, 3)))
+    np.testing.assert_allclose(angles_off_middle_deg(tracks, np.arange(3), cameras), [20, 0, 20], atol=1e-6)
+    np.testing.assert_allclose(angles_deg(tracks, np.arange(3), cameras), [40], atol=1e-6)
 
 
 def test_patches_find_a_shift_under_a_warp():
