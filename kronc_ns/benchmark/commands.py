@@ -45,6 +45,9 @@ class Commands:
             self._running.add(process)
         try:
             output, errors = process.communicate()
+        except BaseException:  # a signal's, for one: nobody is left to wait for it
+            process.terminate()
+            raise
         finally:
             with self._lock:
                 self._running.discard(process)

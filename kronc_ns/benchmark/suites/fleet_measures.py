@@ -252,7 +252,7 @@ class _MadeUp:
         return [event for task, done in told for event in (Event(task, "told", done), Event(task, "ended"))]
 
     def end(self, task: int) -> None:
-        raise NotImplementedError
+        self._waiting = [(number, one) for number, one in self._waiting if number != task]
 
     def stop(self) -> list[Any]:
         return []
