@@ -12,7 +12,6 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model, ModelConfig
-from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
@@ -25,6 +24,7 @@ from kronc_ns.plugin.barf.settling import last_tenth, verdict
 from kronc_ns.plugin.checks import check_not_negative, check_positive
 from kronc_ns.plugin.dvgo.equations import render_weights
 from kronc_ns.plugin.dvgo.sampling import ray_box
+from kronc_ns.plugin.pictures import compare
 from kronc_ns.plugin.transparency import rgba
 
 _FEWEST_VIEWS = 3
@@ -225,12 +225,5 @@ class BarfModel(Model):
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM and LPIPS of an image; truth beside rendering, accumulation and depth."""
-        image = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
-        images = {
-            "img": torch.cat([image, outputs["rgb"]], dim=1),
-            "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
-            "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
-        }
-        truth, rendered = (x.movedim(-1, 0)[None] for x in (image, outputs["rgb"]))
-        measures = {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips}
-        return {name: float(measure(rendered, truth)) for name, measure in measures.items()}, images
+        truth = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
+        return compare(truth, outputs, {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips})

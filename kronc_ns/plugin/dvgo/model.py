@@ -17,7 +17,6 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.renderers import AccumulationRenderer, RGBRenderer
 from nerfstudio.models.base_model import Model, ModelConfig
-from nerfstudio.utils import colormaps
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -29,6 +28,7 @@ from kronc_ns.plugin.dvgo.field import CoarseField, DensityGridField, FineField,
 from kronc_ns.plugin.dvgo.grid import UnknownSpace
 from kronc_ns.plugin.dvgo.losses import StageLosses, beside_photometric
 from kronc_ns.plugin.dvgo.sampling import ray_box, sample_rays
+from kronc_ns.plugin.pictures import compare
 from kronc_ns.plugin.transparency import rgba
 
 
@@ -254,16 +254,5 @@ class DVGOModel(Model):
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM and LPIPS of an image; truth beside rendering, accumulation and depth."""
-        image = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
-        images = {
-            "img": torch.cat([image, outputs["rgb"]], dim=1),
-            "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
-            "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
-        }
-        truth, rendered = _for_metrics(image), _for_metrics(outputs["rgb"])
-        measures = {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips}
-        return {name: float(measure(rendered, truth)) for name, measure in measures.items()}, images
-
-
-def _for_metrics(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
-    return image.movedim(-1, 0)[None]
+        truth = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
+        return compare(truth, outputs, {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips})
