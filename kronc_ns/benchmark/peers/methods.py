@@ -21,13 +21,17 @@ from kronc_ns.benchmark.peers.ceres import bundle_adjustment, load_pycolmap
 from kronc_ns.benchmark.peers.colmap import map_images, map_keypoints
 from kronc_ns.benchmark.subjects import Subject
 from kronc_ns.errors import KroncError
+from kronc_ns.files.photos import photos
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.fit.starts import circular_poses
+from kronc_ns.refine.pipeline import refine_scene
 from kronc_ns.scene import Scene
+from kronc_ns.solution import Solution
 
 Method = Literal[
     "kronc",
+    "kronc-images",
     "adam",
     "ceres",
     "colmap-incremental",
@@ -37,9 +41,11 @@ Method = Literal[
     "keypoints-incremental",
     "keypoints-global",
 ]
-"""kronc: the default solver; adam: the paper's; ceres: bundle adjustment of the same keypoints by pycolmap with a
-Cauchy loss; colmap-...: COLMAP's mappers on SIFT features (all of them, or the vehicle's); keypoints-...: the same
-mappers on the keypoints."""
+"""kronc: the default solver; kronc-images: the same, refined by image features; adam: the paper's; ceres: bundle
+adjustment of the same keypoints by pycolmap with a Cauchy loss; colmap-...: COLMAP's mappers on SIFT features (all of
+them, or the vehicle's); keypoints-...: the same mappers on the keypoints."""
+
+_NO_IMAGES = "{} needs images: give scene folders with --captures"
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,7 @@ def place(
 
 def _warm_up(method: Method, scene: Scene, folder: Path | None, config: KroncConfig | None) -> None:
     """What a method does once in a process only: compile itself, load libraries."""
-    if method in ("kronc", "ceres"):
+    if method in ("kronc", "kronc-images", "ceres"):
         _poses(method, scene, folder, config)
     elif method == "adam":
         _poses(method, scene, folder, one_step(config or PAPERS))
@@ -99,10 +105,20 @@ def _measured(warm_up: Callable[[], None], run: Callable[[], np.ndarray]) -> Pla
     return Placed(c2w, seconds, megabytes)
 
 
+def _solved(scene: Scene, config: KroncConfig | None) -> Solution:
+    return solve_scene(scene, replace(config or KroncConfig(), solver="lm", min_status="solved"))
+
+
 def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfig | None) -> Float[np.ndarray, "n 3 4"]:
     match method:
         case "kronc":
-            return solve_scene(scene, replace(config or KroncConfig(), solver="lm", min_status="solved")).c2w
+            return _solved(scene, config).c2w
+        case "kronc-images":
+            if folder is None:
+                raise KroncError(_NO_IMAGES.format(method))
+            solution = _solved(scene, config)
+            right = scene.with_sides_swapped(np.array([view.swapped for view in solution.views]))
+            return refine_scene(right, solution, photos(folder, scene)).c2w
         case "adam":
             return solve_scene(scene, replace(config or PAPERS, solver="adam", min_status="solved")).c2w
         case "ceres":
@@ -113,7 +129,7 @@ def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfi
             return bundle_adjustment(scene, start, loss="cauchy").c2w
         case "colmap-incremental" | "colmap-global" | "colmap-incremental-masked" | "colmap-global-masked":
             if folder is None:
-                raise KroncError(f"{method} needs images: give scene folders with --captures")
+                raise KroncError(_NO_IMAGES.format(method))
             return map_images(scene, folder, "global" if "global" in method else "incremental", "masked" in method)
         case "keypoints-incremental":
             return map_keypoints(scene, "incremental")

@@ -14,6 +14,7 @@ _SUBSETS = (1.0, 0.75, 0.5, 0.25, 0.1)
 _PRIOR_NOISE = 0.1
 _ON_KEYPOINTS: tuple[Method, ...] = ("kronc", "adam", "keypoints-incremental", "keypoints-global")
 _ON_IMAGES: tuple[Method, ...] = (
+    "kronc-images",
     "colmap-incremental",
     "colmap-global",
     "colmap-incremental-masked",
