@@ -13,8 +13,8 @@ from kronc_ns.fit.options import KroncConfig
 _SUBSETS = (1.0, 0.75, 0.5, 0.25, 0.1)
 _PRIOR_NOISE = 0.1
 _ON_KEYPOINTS: tuple[Method, ...] = ("kronc", "adam", "keypoints-incremental", "keypoints-global")
+_ON_BOTH: tuple[Method, ...] = ("kronc-images",)
 _ON_IMAGES: tuple[Method, ...] = (
-    "kronc-images",
     "colmap-incremental",
     "colmap-global",
     "colmap-incremental-masked",
@@ -102,7 +102,7 @@ def by_subset(options: TableOptions) -> list[Setting]:
     for share in _SUBSETS:
         label, subset = {"images": f"{100 * share:.0f} %"}, partial(_share, share)
         for noise_px in options.noise_px:
-            for method in _ON_KEYPOINTS:
+            for method in (*_ON_KEYPOINTS, *_ON_BOTH):
                 config = adam.FROM_CIRCLE if method == "adam" else None
                 rows.append(_solved(label, method, noise_px, None, config, subset))
             limit = _solved(label, "ceres", noise_px, (0.0, 0.0), None, subset)
