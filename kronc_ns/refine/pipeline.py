@@ -124,7 +124,7 @@ def _found(
     if not len(fitted):
         return None
     latest = adjust(keypoints, fitted, gathered, start, None)
-    for _ in range(_ROUNDS):
+    for done in range(1, _ROUNDS + 1):
         tracks = find_tracks(gathered, search, latest.rig, keypoints, latest)
         tracks = enough(tracks, gathered.view, _TRACKS_OF_VIEW, rng)
         aligned = align(tracks, gathered, latest.rig)
@@ -136,6 +136,8 @@ def _found(
             return None
         latest = adjust(keypoints, known, aligned, latest.rig, config)
         if latest.after_px > _MATCHED_WELL * latest.before_px:
+            for _ in range((_ROUNDS - done) * len(search.pairs)):
+                search.advance()  # over what need not be searched again
             break
     evidence = weigh(reserved, aligned, keypoints, start, latest.rig, latest.sigma_px)
     final = adjust(keypoints, _placed(tracks, aligned, latest), aligned, latest.rig, config, latest.sigma_px)

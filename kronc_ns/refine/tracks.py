@@ -176,7 +176,8 @@ def rays(
 ) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "p 3"]]:
     """Directions in which each sighting sees its point, and the mean direction of each track."""
     ray = unit(tracks.points[tracks.of_track] - cameras.centre[view[tracks.feature]])
-    mean = np.stack([np.bincount(tracks.of_track, weights=axis, minlength=len(tracks)) for axis in ray.T], axis=1)
+    mean = np.zeros((len(tracks), 3))
+    np.add.at(mean, tracks.of_track, ray)
     return ray, unit(mean)
 
 
