@@ -140,6 +140,11 @@ class Solution:
         return np.array([view.status is status for view in self.views], dtype=bool)
 
     @property
+    def swapped(self) -> Bool[np.ndarray, "n"]:
+        """Which views' left and right were put right."""
+        return np.array([view.swapped for view in self.views], bool)
+
+    @property
     def posed(self) -> Bool[np.ndarray, "n"]:
         """Which views have a pose, solved or completed."""
         return ~self.views_that_are(ViewStatus.FAILED)

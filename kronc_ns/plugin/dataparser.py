@@ -121,7 +121,7 @@ class KroncDataParser(DataParser):
             return None
 
         def refined(solution: Solution) -> Solution:
-            right = scene.with_sides_swapped(np.array([view.swapped for view in solution.views]))
+            right = scene.with_sides_swapped(solution.swapped)
             return refine_with_bar(config.data, right, solution, refine)
 
         return refine, refined

@@ -8,7 +8,6 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Annotated, Union
 
-import numpy as np
 import tyro
 from rich.console import Console
 
@@ -175,7 +174,7 @@ class KroncToNerfstudio:
             scene, solution, again = _look_again(detector, scene, solution, config, out)
         refine = self.images.refine_config(config.refine_focal, config.refine_k1, config.seed)
         if refine is not None and solution.status is not Status.FAILED and config.solver != "none":
-            right = scene.with_sides_swapped(np.array([view.swapped for view in solution.views]))
+            right = scene.with_sides_swapped(solution.swapped)
             solution = refine_with_bar(out, right, solution, refine)
         report = write_solution(out, scene, solution, out, fingerprint(scene, config))
 

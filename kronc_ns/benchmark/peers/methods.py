@@ -117,7 +117,7 @@ def _poses(method: Method, scene: Scene, folder: Path | None, config: KroncConfi
             if folder is None:
                 raise KroncError(_NO_IMAGES.format(method))
             solution = _solved(scene, config)
-            right = scene.with_sides_swapped(np.array([view.swapped for view in solution.views]))
+            right = scene.with_sides_swapped(solution.swapped)
             return refine_scene(right, solution, photos(folder, scene)).c2w
         case "adam":
             return solve_scene(scene, replace(config or PAPERS, solver="adam", min_status="solved")).c2w

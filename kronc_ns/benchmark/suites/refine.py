@@ -200,7 +200,7 @@ def _refined(subject: Subject, focal: float, trouble: Trouble, region: Region) -
     solution = solve_scene(scene, KroncConfig(refine_focal=unknown))
     if solution.status is Status.FAILED:
         raise KroncError(f"the keypoints have no solution: {solution.reason}")
-    right = scene.with_sides_swapped(np.array([view.swapped for view in solution.views]))
+    right = scene.with_sides_swapped(solution.swapped)
     begin = time.perf_counter()
     refined = refine_scene(right, solution, pictures, RefineConfig(region, unknown))
     seconds = time.perf_counter() - begin

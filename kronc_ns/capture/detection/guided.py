@@ -60,7 +60,7 @@ def look_again(
     """The scene with the points of views that have a pose detected anew near where the solved ones project."""
     located = np.flatnonzero(posed(solution.c2w)).tolist()
     images = [CarImage(folder / scene.names[view]) for view in located]
-    keypoints = scene.with_sides_swapped(np.array([view.swapped for view in solution.views])).keypoints.copy()
+    keypoints = scene.with_sides_swapped(solution.swapped).keypoints.copy()
     sigma = np.ones(keypoints.shape[:2]) if scene.sigma_px is None else scene.sigma_px.copy()
     answers = detector.look_again(images, expected_places(solution)[located])
     for count, (view, car) in enumerate(zip(located, answers, strict=True), start=1):
