@@ -24,9 +24,6 @@ _FEATURES, _LEAST_OF_VIEW, _MOST_OF_VIEW = 100_000, 1_500, 4_000
 _NEIGHBOURS, _NEIGHBOURS_DEG = 2, 35.0  # that corners are followed to
 _CORNER_SIMILARITY, _CORNER_RATIO = 0.93, 0.5  # what a followed corner is worth beside a match of descriptors
 
-Progress = Callable[[int, int, float | None], None]
-"""Called with (done, of how many, None)."""
-
 
 @dataclass(frozen=True)
 class Gathered:

@@ -1,0 +1,110 @@
+"""Views that features place elsewhere than keypoints did: a view's features against all points, its pose unknown.
+
+Guided matching only finds what lies near the lines of the poses it starts from. A view whose keypoints were taken for
+their mirror images, or none were found, is found here or not at all.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from kronc_ns.refine.adjustment import Adjusted
+from kronc_ns.refine.gathering import Gathered
+from kronc_ns.refine.rig import Rig
+
+_LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewhere
+_RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricter
+_LEAST_OTHERS = 2  # views that a point must be seen in besides
+_TRIALS, _CONFIDENCE, _AGREES_PX = 3000, 0.9999, 4.0  # of RANSAC
+_LEAST_AGREEING, _GAIN, _MORE = 12, 1.3, 4  # matches that the new pose explains: in all; over those of the old
+
+
+def relocated(adjusted: Adjusted, gathered: Gathered) -> Rig:
+    """The cameras, those with few features where more of them agree; the others as they were."""
+    tracks, rig = adjusted.tracks, adjusted.rig
+    long = tracks.chosen(tracks.lengths >= 3)
+    sightings = np.bincount(adjusted.gathered.view[long.feature], minlength=len(rig.rotation))
+    loose = np.flatnonzero(sightings < _LOOSE * np.median(sightings))
+    rotation, translation = rig.rotation.copy(), rig.translation.copy()
+    for view in loose.tolist():
+        points, uv = _matched(adjusted, gathered, gathered, view, rig, of_it=view)
+        found = _pose(points, uv, rig.focal)
+        if found is None:
+            continue
+        before = _agreeing(points, uv, (rig.rotation[view], rig.translation[view]), rig.focal)
+        if _agreeing(points, uv, found, rig.focal) > _GAIN * before + _MORE:
+            rotation[view], translation[view] = found
+    return replace(rig, rotation=rotation, translation=translation)
+
+
+def placed(adjusted: Adjusted, gathered: Gathered, absent: Gathered, rig: Rig) -> Rig:
+    """``rig``, of views that took no part and have the features ``absent``, with poses; NaN where these tell none."""
+    rotation, translation = np.full_like(rig.rotation, np.nan), np.full_like(rig.translation, np.nan)
+    for view in range(len(rotation)):
+        found = _pose(*_matched(adjusted, gathered, absent, view, rig), rig.focal)
+        if found is not None:
+            rotation[view], translation[view] = found
+    return replace(rig, rotation=rotation, translation=translation)
+
+
+def _matched(
+    adjusted: Adjusted, gathered: Gathered, seen: Gathered, view: int, rig: Rig, of_it: int = -1
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 2"]]:
+    """Points that look like features of a view of ``seen``, and where it has them in ideal pixels of ``rig``.
+
+    What the view ``of_it`` of the adjustment sees does not count.
+    """
+    tracks = adjusted.tracks
+    elsewhere = adjusted.gathered.view[tracks.feature] != of_it
+    believed = np.bincount(tracks.of_track[elsewhere], minlength=len(tracks)) >= _LEAST_OTHERS
+    used = elsewhere & (tracks.feature < gathered.sift) & believed[tracks.of_track]
+    own = np.arange(seen.first[view], seen.first[view + 1])
+    point = tracks.of_track[used]
+    if not len(own) or not len(point):
+        return np.empty((0, 3)), np.empty((0, 2))
+    alike = seen.descriptor[own] @ gathered.descriptor[tracks.feature[used]].T
+    best = alike.argmax(1)
+    first = alike[np.arange(len(own)), best]
+    second = np.where(point == point[best][:, None], -1.0, alike).max(1)
+    distance, next_distance = (np.sqrt(np.maximum(2 - 2 * one, 0.0)) for one in (first, second))
+    chosen = np.flatnonzero((distance < _RATIO * next_distance) & (first > _SIMILAR))
+    chosen = chosen[np.argsort(-first[chosen], kind="stable")]
+    chosen = chosen[np.unique(point[best[chosen]], return_index=True)[1]]  # each point once, where it looks most alike
+    uv = rig.ideal(seen.pixel[own[chosen]], np.full(len(chosen), view))
+    return tracks.points[point[best[chosen]]], uv
+
+
+def _pose(
+    points: Float[np.ndarray, "m 3"], uv: Float[np.ndarray, "m 2"], focal: float
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
+    """World to camera as most matches have it; None where no pose explains enough of them."""
+    if len(points) < _LEAST_AGREEING:
+        return None
+    camera = np.diag([focal, focal, 1.0])
+    found, turn, shift, _ = cv2.solvePnPRansac(
+        points,
+        uv,
+        camera,
+        np.zeros(4),
+        iterationsCount=_TRIALS,
+        reprojectionError=_AGREES_PX,
+        confidence=_CONFIDENCE,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    pose = (cv2.Rodrigues(turn)[0], shift[:, 0]) if found else None
+    return pose if pose and _agreeing(points, uv, pose, focal) >= _LEAST_AGREEING else None
+
+
+def _agreeing(
+    points: Float[np.ndarray, "m 3"],
+    uv: Float[np.ndarray, "m 2"],
+    pose: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]],
+    focal: float,
+) -> int:
+    """How many matches a pose explains."""
+    seen = points @ pose[0].T + pose[1]
+    ahead = seen[:, 2] > 0
+    off = np.linalg.norm(seen[ahead, :2] / seen[ahead, 2:] * focal - uv[ahead], axis=1)
+    return int((off < _AGREES_PX).sum())

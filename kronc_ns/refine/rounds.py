@@ -1,0 +1,140 @@
+"""Matching and adjustment in turns: features by the keypoints' poses, then by those that features lead to."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from kronc_ns.geometry.rotations import rotation_angle_deg
+from kronc_ns.refine.adjustment import Adjusted, adjust
+from kronc_ns.refine.counter import Counter
+from kronc_ns.refine.gathering import Gathered, gather
+from kronc_ns.refine.keypoints import KeypointTracks, alike
+from kronc_ns.refine.options import RefineConfig
+from kronc_ns.refine.pairs import choose_pairs, view_angles
+from kronc_ns.refine.patches import align, grow
+from kronc_ns.refine.pictures import Pictures
+from kronc_ns.refine.placement import relocated
+from kronc_ns.refine.region import background_is_still, vehicle_features
+from kronc_ns.refine.rig import Rig
+from kronc_ns.refine.search import Search, find_tracks, standing_features
+from kronc_ns.refine.tracks import Tracks, confirmed, enough, place
+from kronc_ns.refine.verdict import Evidence, weigh
+from kronc_ns.scene import Scene
+
+_HELD_OUT = 0.2  # share of the tracks that no fit sees
+_TRACKS_OF_VIEW = 400  # that are enough, once their places are those of patches
+_PAIRED = 20  # sightings of a view in tracks of three, below which its tracks of two count
+_ROUNDS, _SETTLED_DEG = 6, 0.05  # of matching by the poses of features: until these turn less, on average
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Some views of a scene before their features are matched."""
+
+    views: Int[np.ndarray, "n"]
+    start: Rig
+    keypoints: KeypointTracks
+    gathered: Gathered
+    search: Search
+    vehicle: Bool[np.ndarray, "f"]
+    """Which features are the vehicle's."""
+    background_still: bool
+    vehicle_only: bool
+    """Whether no others are used."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The poses that features lead to, and what speaks for them."""
+
+    adjusted: Adjusted
+    keypoints: KeypointTracks
+    """As far as they are believed."""
+    evidence: Evidence
+
+
+def prepare(
+    scene: Scene,
+    views: Int[np.ndarray, "n"],
+    start: Rig,
+    keypoints: KeypointTracks,
+    has_ground: bool,
+    pictures: Pictures,
+    config: RefineConfig,
+    counter: Counter,
+) -> Prepared:
+    """Find features in the photos of some views, whose cameras are ``start``, and say which are used."""
+    angles = _angles(start)
+    pairs = choose_pairs(angles)
+    counter.expect(len(views) + 2 * len(pairs))
+    cameras = [scene.camera_of(view) for view in views.tolist()]
+    gathered = gather(pictures, views, cameras, start.rotation[:, :, 2], angles, counter.advance)
+    uv = start.ideal(gathered.pixel, gathered.view)
+    stands = standing_features(gathered, uv, pairs, angles)
+    vehicle = vehicle_features(gathered, uv, start)
+    turntable = background_is_still(stands, vehicle)
+    vehicle_only = config.region == "vehicle" or (config.region == "auto" and turntable)
+    used = ~stands & vehicle if vehicle_only else ~stands
+    search = Search(pairs, used, has_ground, counter.advance)
+    return Prepared(views, start, keypoints, gathered, search, vehicle, turntable, vehicle_only)
+
+
+def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Found | None:
+    """Poses from features; None where there are no tracks."""
+    start, keypoints, gathered, search = prepared.start, prepared.keypoints, prepared.gathered, prepared.search
+    rng = np.random.default_rng(config.seed)
+    tracks = find_tracks(gathered, search, start, keypoints, None)
+    reserved = tracks.chosen(rng.random(len(tracks)) < _HELD_OUT)
+    held = np.zeros(len(gathered.view), bool)
+    held[reserved.feature] = True
+    fitted = confirmed(_without(tracks, held), gathered.view, _PAIRED)
+    fitted = enough(fitted, gathered.view, _TRACKS_OF_VIEW, rng)
+    if not len(fitted):
+        return None
+    latest = adjust(keypoints, fitted, gathered, start, None)
+    planned = len(search.pairs)
+    for _ in range(_ROUNDS):
+        earlier = latest.rig
+        latest = replace(latest, rig=relocated(latest, gathered))
+        search = replace(search, pairs=choose_pairs(_angles(latest.rig)))
+        counter.expect(len(search.pairs) - planned)
+        planned = 0
+        believed = keypoints.noisier(alike(keypoints, start, latest.rig))
+        tracks = find_tracks(gathered, search, latest.rig, believed, latest)
+        tracks = enough(tracks, gathered.view, _TRACKS_OF_VIEW, rng)
+        aligned = align(tracks, gathered, latest.rig)
+        tracks = _placed(tracks, aligned, latest)
+        tracks, aligned = grow(tracks, aligned, latest.rig)
+        tracks = confirmed(tracks, aligned.view, _PAIRED)
+        known = _without(tracks, np.pad(held, (0, len(aligned.view) - len(held))))
+        if not len(known):
+            return None
+        latest = adjust(believed, known, aligned, latest.rig, config)
+        turned = latest.rig.rotation @ earlier.rotation.transpose(0, 2, 1)
+        if rotation_angle_deg(turned).mean() < _SETTLED_DEG:
+            break
+    evidence = weigh(reserved, aligned, keypoints, start, latest.rig, latest.sigma_px)
+    if not config.refine_focal:
+        freed = adjust(believed, known, aligned, latest.rig, replace(config, refine_focal=True), latest.sigma_px)
+        evidence = replace(evidence, focal_growth=freed.rig.focal / latest.rig.focal)
+    final = adjust(believed, _placed(tracks, aligned, latest), aligned, latest.rig, config, latest.sigma_px)
+    return Found(final, believed, evidence)
+
+
+def _angles(rig: Rig) -> Float[np.ndarray, "n n"]:
+    """Between the directions from which views see the car."""
+    return view_angles(rig.cameras.centre, np.nanmean(rig.keypoints, axis=0))
+
+
+def _placed(tracks: Tracks, gathered: Gathered, adjusted: Adjusted) -> Tracks:
+    """Tracks with their points where adjusted cameras see them."""
+    rig = adjusted.rig
+    return place(tracks, rig.ideal(gathered.pixel, gathered.view), gathered.view, rig.cameras, adjusted.sigma_px)[0]
+
+
+def _without(tracks: Tracks, held: Bool[np.ndarray, "f"]) -> Tracks:
+    """The tracks that have no feature that is held out."""
+    out = np.zeros(len(tracks), bool)
+    out[tracks.of_track[held[tracks.feature]]] = True
+    return tracks.chosen(~out)
