@@ -18,6 +18,7 @@ _LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewher
 _RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricter
 _LEAST_OTHERS = 2  # views that a point must be seen in besides
 _TRIALS, _CONFIDENCE, _AGREES_PX = 3000, 0.9999, 4.0  # of RANSAC
+_CLOSER_PX = (4.0, 4.0, 2.0, 2.0)  # of matches that the pose is then fitted to, in turns
 _LEAST_AGREEING, _GAIN, _MORE = 12, 1.3, 4  # matches that the new pose explains: in all; over those of the old
 
 
@@ -82,19 +83,25 @@ def _pose(
     """World to camera as most matches have it; None where no pose explains enough of them."""
     if len(points) < _LEAST_AGREEING:
         return None
-    camera = np.diag([focal, focal, 1.0])
+    camera, undistorted = np.diag([focal, focal, 1.0]), np.zeros(4)
     found, turn, shift, _ = cv2.solvePnPRansac(
         points,
         uv,
         camera,
-        np.zeros(4),
+        undistorted,
         iterationsCount=_TRIALS,
         reprojectionError=_AGREES_PX,
         confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_SQPNP,
     )
-    pose = (cv2.Rodrigues(turn)[0], shift[:, 0]) if found else None
-    return pose if pose and _agreeing(points, uv, pose, focal) >= _LEAST_AGREEING else None
+    if not found:
+        return None
+    for within in _CLOSER_PX:  # far points hold a camera's place but loosely: near ones join as it moves
+        agree = _errors(points, uv, (cv2.Rodrigues(turn)[0], shift[:, 0]), focal) < within
+        if agree.sum() < _LEAST_AGREEING:
+            return None
+        turn, shift = cv2.solvePnPRefineLM(points[agree], uv[agree], camera, undistorted, turn, shift)
+    return cv2.Rodrigues(turn)[0], shift[:, 0]
 
 
 def _agreeing(
@@ -104,7 +111,17 @@ def _agreeing(
     focal: float,
 ) -> int:
     """How many matches a pose explains."""
+    return int((_errors(points, uv, pose, focal) < _AGREES_PX).sum())
+
+
+def _errors(
+    points: Float[np.ndarray, "m 3"],
+    uv: Float[np.ndarray, "m 2"],
+    pose: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]],
+    focal: float,
+) -> Float[np.ndarray, "m"]:
+    """Of each match in pixels; inf behind the camera."""
     seen = points @ pose[0].T + pose[1]
     ahead = seen[:, 2] > 0
-    off = np.linalg.norm(seen[ahead, :2] / seen[ahead, 2:] * focal - uv[ahead], axis=1)
-    return int((off < _AGREES_PX).sum())
+    off = seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None] * focal - uv
+    return np.where(ahead, np.linalg.norm(off, axis=1), np.inf)
