@@ -113,7 +113,10 @@ def _with_newcomers(
     counter.expect(count)
     cameras = [scene.camera_of(view) for view in absent.tolist()]
     features = gather(pictures, absent, cameras, up, np.full((count, count), math.inf), counter.advance)
-    newcomers = placed(found.adjusted, prepared.gathered, features, nowhere)
+    used = np.ones(len(features.view), bool)
+    if prepared.vehicle_only and features.on_vehicle is not None:
+        used = features.on_vehicle
+    newcomers = placed(found.adjusted, prepared.gathered, features, used, nowhere)
     come = np.isfinite(newcomers.translation).all(1)
     if not come.any():
         return prepared, found

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
@@ -19,18 +19,21 @@ _RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricte
 _LEAST_OTHERS = 2  # views that a point must be seen in besides
 _TRIALS, _CONFIDENCE, _AGREES_PX = 3000, 0.9999, 4.0  # of RANSAC
 _CLOSER_PX = (4.0, 4.0, 2.0, 2.0)  # of matches that the pose is then fitted to, in turns
-_LEAST_AGREEING, _GAIN, _MORE = 12, 1.3, 4  # matches that the new pose explains: in all; over those of the old
+_LEAST_AGREEING, _GAIN, _MORE = 15, 3, 4  # matches that the new pose explains: in all; over those of the old
 
 
-def relocated(adjusted: Adjusted, gathered: Gathered) -> Rig:
-    """The cameras, those with few features where more of them agree; the others as they were."""
+def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"]) -> Rig:
+    """The cameras, those with few features where more of them agree; the others as they were.
+
+    ``used`` are the features that may be matched.
+    """
     tracks, rig = adjusted.tracks, adjusted.rig
     long = tracks.chosen(tracks.lengths >= 3)
     sightings = np.bincount(adjusted.gathered.view[long.feature], minlength=len(rig.rotation))
     loose = np.flatnonzero(sightings < _LOOSE * np.median(sightings))
     rotation, translation = rig.rotation.copy(), rig.translation.copy()
     for view in loose.tolist():
-        points, uv = _matched(adjusted, gathered, gathered, view, rig, of_it=view)
+        points, uv = _matched(adjusted, gathered, gathered, used, view, rig, of_it=view)
         found = _pose(points, uv, rig.focal)
         if found is None:
             continue
@@ -40,20 +43,26 @@ def relocated(adjusted: Adjusted, gathered: Gathered) -> Rig:
     return replace(rig, rotation=rotation, translation=translation)
 
 
-def placed(adjusted: Adjusted, gathered: Gathered, absent: Gathered, rig: Rig) -> Rig:
+def placed(adjusted: Adjusted, gathered: Gathered, absent: Gathered, used: Bool[np.ndarray, "f"], rig: Rig) -> Rig:
     """``rig``, of views that took no part and have the features ``absent``, with poses; NaN where these tell none."""
     rotation, translation = np.full_like(rig.rotation, np.nan), np.full_like(rig.translation, np.nan)
     for view in range(len(rotation)):
-        found = _pose(*_matched(adjusted, gathered, absent, view, rig), rig.focal)
+        found = _pose(*_matched(adjusted, gathered, absent, used, view, rig), rig.focal)
         if found is not None:
             rotation[view], translation[view] = found
     return replace(rig, rotation=rotation, translation=translation)
 
 
 def _matched(
-    adjusted: Adjusted, gathered: Gathered, seen: Gathered, view: int, rig: Rig, of_it: int = -1
+    adjusted: Adjusted,
+    gathered: Gathered,
+    seen: Gathered,
+    may: Bool[np.ndarray, "f"],
+    view: int,
+    rig: Rig,
+    of_it: int = -1,
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 2"]]:
-    """Points that look like features of a view of ``seen``, and where it has them in ideal pixels of ``rig``.
+    """Points that look like features that a view of ``seen`` may use, and where it has them in ideal pixels of ``rig``.
 
     What the view ``of_it`` of the adjustment sees does not count.
     """
@@ -62,6 +71,7 @@ def _matched(
     believed = np.bincount(tracks.of_track[elsewhere], minlength=len(tracks)) >= _LEAST_OTHERS
     used = elsewhere & (tracks.feature < gathered.sift) & believed[tracks.of_track]
     own = np.arange(seen.first[view], seen.first[view + 1])
+    own = own[may[own]]
     point = tracks.of_track[used]
     if not len(own) or not len(point):
         return np.empty((0, 3)), np.empty((0, 2))

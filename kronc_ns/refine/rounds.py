@@ -18,13 +18,14 @@ from kronc_ns.refine.placement import relocated
 from kronc_ns.refine.region import background_is_still, vehicle_features
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.search import Search, find_tracks, standing_features
-from kronc_ns.refine.tracks import Tracks, confirmed, enough, place
+from kronc_ns.refine.tracks import Tracks, confirmed, enough, of_held_views, place
 from kronc_ns.refine.verdict import Evidence, weigh
 from kronc_ns.scene import Scene
 
 _HELD_OUT = 0.2  # share of the tracks that no fit sees
 _TRACKS_OF_VIEW = 400  # that are enough, once their places are those of patches
 _PAIRED = 20  # sightings of a view in tracks of three, below which its tracks of two count
+_HELD_SHARE = 0.1  # of the usual sightings of a view: fewer are as likely wrong, and keypoints place it better
 _ROUNDS, _SETTLED_DEG = 6, 0.05  # of matching by the poses of features: until these turn less, on average
 
 
@@ -96,7 +97,7 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
     planned = len(search.pairs)
     for _ in range(_ROUNDS):
         earlier = latest.rig
-        latest = replace(latest, rig=relocated(latest, gathered))
+        latest = replace(latest, rig=relocated(latest, gathered, search.used))
         search = replace(search, pairs=choose_pairs(_angles(latest.rig)))
         counter.expect(len(search.pairs) - planned)
         planned = 0
@@ -107,6 +108,7 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
         tracks = _placed(tracks, aligned, latest)
         tracks, aligned = grow(tracks, aligned, latest.rig)
         tracks = confirmed(tracks, aligned.view, _PAIRED)
+        tracks = of_held_views(tracks, aligned.view, _HELD_SHARE)
         known = _without(tracks, np.pad(held, (0, len(aligned.view) - len(held))))
         if not len(known):
             return None

@@ -131,6 +131,15 @@ def confirmed(tracks: Tracks, view: Int[np.ndarray, "f"], least: int) -> Tracks:
     return tracks.chosen(long | pairs)
 
 
+def of_held_views(tracks: Tracks, view: Int[np.ndarray, "f"], share: float) -> Tracks:
+    """The tracks less the sightings of views that have less than a share of the usual sightings in tracks of three."""
+    long = tracks.chosen(tracks.lengths >= 3)
+    seen = np.bincount(view[long.feature], minlength=int(view.max(initial=0)) + 1)
+    keep = (seen >= share * np.median(seen))[view[tracks.feature]]
+    left = rows_of(tracks.feature[keep], tracks.of_track[keep], tracks.points)
+    return left.chosen(left.lengths >= 2)
+
+
 def place(
     tracks: Tracks,
     uv: Float[np.ndarray, "f 2"],
