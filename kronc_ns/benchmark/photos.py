@@ -15,10 +15,13 @@ from kronc_ns.capture.images import upright_size
 from kronc_ns.errors import KroncError
 from kronc_ns.files.keypoints import match_keypoints, sigma_of
 from kronc_ns.files.output import read_json
+from kronc_ns.files.photos import photos as read_photos
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.geometry.poses import posed
+from kronc_ns.refine.options import RefineConfig
+from kronc_ns.refine.pipeline import refine_scene
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution, Status
 
@@ -92,8 +95,8 @@ def main_car(detector: Detector, path: Path) -> CarDetection | None:
 
 def solve_photos(
     detector: Detector, photos: Sequence[Path], focal_px: float | None, centre: tuple[float, float] | None = None
-) -> Solution:
-    """Keypoints, poses, a second look: what `ns-process-data kronc` does with photos of one size."""
+) -> tuple[Solution, Solution]:
+    """What `ns-process-data kronc` does with photos of one size: keypoints, poses, a second look; image features."""
     sizes = [upright_size(path) for path in photos]
     if len({*sizes}) != 1:
         raise KroncError(f"{photos[0].parent} holds photos of {len({*sizes})} sizes: expected one")
@@ -108,8 +111,10 @@ def solve_photos(
     config = KroncConfig(refine_focal=focal_px is None)
     solution = solve_scene(scene, config)
     if isinstance(detector, GuidedDetector) and solution.status is not Status.FAILED:
-        _, solution, _ = second_look(detector, photos[0].parent, scene, solution, config)
-    return solution
+        scene, solution, _ = second_look(detector, photos[0].parent, scene, solution, config)
+    right = scene.with_sides_swapped(solution.swapped)
+    pictures = read_photos(photos[0].parent, right)
+    return solution, refine_scene(right, solution, pictures, RefineConfig(refine_focal=focal_px is None))
 
 
 def turn_steps(c2w: Float[np.ndarray, "n 3 4"]) -> tuple[Float[np.ndarray, "m"], Bool[np.ndarray, "m"]]:

@@ -133,8 +133,11 @@ def test_photos_are_solved_as_users_solve_them(tmp_path, monkeypatch):
         picture = np.full((capture.camera.height, capture.camera.width, 3), number, np.uint8)
         cv2.imwrite(str(photos[-1]), picture)
     camera = capture.camera
-    solution = solve_photos(_Oracle(capture.keypoints), photos, camera.fx, (camera.cx, camera.cy))
-    assert np.median(pose_errors(solution.c2w, capture.c2w)[0]) < 0.6
+    by_keypoints, refined = solve_photos(_Oracle(capture.keypoints), photos, camera.fx, (camera.cx, camera.cy))
+    assert np.median(pose_errors(by_keypoints.c2w, capture.c2w)[0]) < 0.6
+    assert refined.images is not None
+    assert not refined.images.accepted, "there is nothing to see in these photos"
+    np.testing.assert_array_equal(refined.c2w, by_keypoints.c2w)
 
 
 def test_calibration_error_of_what_is_known(tmp_path):

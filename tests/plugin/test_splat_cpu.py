@@ -175,6 +175,15 @@ def test_unseen_and_broken_gaussians_leave_the_others_alone():
     assert all(t.grad[:62].isfinite().all() for t in strays)
 
 
+def test_a_scene_that_lost_all_its_gaussians_still_trains_its_background():
+    tensors, tiles, background = flat_scene(0)
+    inputs = [t.requires_grad_() for t in (*tensors, background)]
+    image, _ = rasterize_to_pixels(*inputs[:-1], tiles, 9, 8, inputs[-1], absgrad=True)
+    image.sum().backward()
+    assert (inputs[-1].grad == 9 * 8).all()
+    assert inputs[0].grad.shape == inputs[0].absgrad.shape == (1, 0, 2)
+
+
 def test_an_empty_view_is_background():
     tensors, view = random_scene(5, bands=None)
     tensors[0][:, 2] = -10

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 
 from kronc_ns.benchmark.figures import Figures, pose_figures
 from kronc_ns.benchmark.photos import (
@@ -34,6 +35,7 @@ from kronc_ns.solution import Solution, Status, ViewStatus
 
 Shown: TypeAlias = Mapping[Statistic, tuple[str, ...]]
 _TURNS = ("spin_duster_turntable", "spin_evox_stinger_blue", "spin_ertiga", "orbit_asx_park")
+_BEFORE = ("keypoints_deg", "keypoints_cm", "refined")
 _NOTHINGS = 20
 _CALIBRATION_PICTURES, _WALK_VIEWS = 120, 36
 _FRAMES, _FRAME_SIZE = 100, (1920, 1080)
@@ -95,6 +97,7 @@ def _turntable_rows(detector: Detector, folder: Path) -> list[Row]:
             1,
             partial(_poses, detector, folder, True),
             (Limit("solved", at_least=36.0), Limit("median_deg", at_most=1.5), Limit("median_cm", at_most=25.0)),
+            {"mean": _BEFORE},
         ),
         Row(
             "spin_suv: poses, focal length unknown",
@@ -102,7 +105,7 @@ def _turntable_rows(detector: Detector, folder: Path) -> list[Row]:
             1,
             partial(_poses, detector, folder, False),
             (Limit("solved", at_least=36.0), Limit("median_deg", at_most=2.5)),
-            {"mean": ("median_cm",)},
+            {"mean": ("median_cm", *_BEFORE)},
         ),
     ]
 
@@ -113,7 +116,9 @@ def _turn_row(detector: Detector, folder: Path) -> list[Row]:
         Limit("step_rms_deg", at_most=1.5),
         Limit("sides_confused", "total", at_most=0.0),
     )
-    shown: Shown = {"mean": ("solved", "views", "radius_rms_percent", "height_rms_percent")}
+    shown: Shown = {
+        "mean": ("keypoints_step_rms_deg", "refined", "solved", "views", "radius_rms_percent", "height_rms_percent")
+    }
     measure = partial(_turn, detector, folder)
     return [Row(folder.name, "photos at equal steps, focal length unknown, no labels", 1, measure, limits, shown)]
 
@@ -143,7 +148,7 @@ def _render_rows(detector: Detector, folder: Path) -> list[Row]:
             3,
             partial(_walk, detector, folder / name),
             limits,
-            {"mean": ("solved",)},
+            {"mean": ("solved", *_BEFORE)},
         )
         for name in UNSEEN
     ]
@@ -181,20 +186,22 @@ def _poses(detector: Detector, folder: Path, with_focal: bool, _: int) -> Figure
     truth = read_poses(folder / "reference.json")
     photos = photos_in(folder / "images")
     centre = (camera.cx, camera.cy) if with_focal else None
-    solution = solve_photos(detector, photos, camera.fx if with_focal else None, centre)
-    reference = np.stack([truth[f"images/{photo.name}"] for photo in photos])
-    return {**pose_figures(solution.c2w, reference), "solved": float(_solved(solution))}
+    solutions = solve_photos(detector, photos, camera.fx if with_focal else None, centre)
+    return _figures(*solutions, np.stack([truth[f"images/{photo.name}"] for photo in photos]))
 
 
 def _turn(detector: Detector, folder: Path, _: int) -> Figures:
     photos = photos_in(folder / "images")
-    solution = solve_photos(detector, photos, None)
+    by_keypoints, solution = solve_photos(detector, photos, None)
+    before = turn_steps(by_keypoints.c2w)[0]
     residual, confused = turn_steps(solution.c2w)
     eye = solution.c2w[np.isfinite(solution.c2w).all((1, 2)), :, 3]
     radius = np.hypot(eye[:, 0], eye[:, 1])
     return {
         "converged": float(solution.status is Status.CONVERGED),
         "step_rms_deg": float(np.sqrt(np.mean(residual**2))),
+        "keypoints_step_rms_deg": float(np.sqrt(np.mean(before**2))),
+        "refined": _refined(solution),
         "sides_confused": float(confused.sum()),
         "solved": float(_solved(solution)),
         "views": float(len(photos)),
@@ -230,9 +237,8 @@ def _walk(detector: Detector, folder: Path, seed: int) -> Figures:
 
     with TemporaryDirectory(prefix="kronc-walk-") as output:
         photos, truth = rendered_walk(folder, _WALK_VIEWS, seed, Path(output))
-        solution = solve_photos(detector, photos, WALK_FOCAL_PX)
-    converged = float(solution.status is Status.CONVERGED)
-    return {**pose_figures(solution.c2w, truth), "solved": float(_solved(solution)), "converged": converged}
+        solutions = solve_photos(detector, photos, WALK_FOCAL_PX)
+    return {**_figures(*solutions, truth), "converged": float(solutions[1].status is Status.CONVERGED)}
 
 
 def _false_alarms(detector: Detector, kind: str, _: int) -> Figures:
@@ -284,6 +290,22 @@ def _time(weights: Path | None, seed: int) -> Figures:
     if done.returncode:
         raise KroncError(f"detection in a process of its own failed: {done.stderr.strip().splitlines()[-1]}")
     return {name: float(value) for name, value in json.loads(done.stdout).items()}
+
+
+def _figures(by_keypoints: Solution, refined: Solution, truth: Float[np.ndarray, "n 3 4"]) -> Figures:
+    """Of the poses that are handed on; beside them medians of those by keypoints alone, and which were taken."""
+    before = pose_figures(by_keypoints.c2w, truth)
+    return {
+        **pose_figures(refined.c2w, truth),
+        "solved": float(_solved(refined)),
+        "keypoints_deg": before["median_deg"],
+        "keypoints_cm": before["median_cm"],
+        "refined": _refined(refined),
+    }
+
+
+def _refined(solution: Solution) -> float:
+    return float(solution.images is not None and solution.images.accepted)
 
 
 def _solved(solution: Solution) -> int:

@@ -58,7 +58,7 @@ class RasterizeToPixels(torch.autograd.Function):
         images = (render, transmittance, v_render, v_alpha)
         _over_tiles(kernels.rasterize_backward, tiles, *inputs, *lists, *images, v_pairs)
         kernels.sum_over_tiles(v_pairs, tiles.starts, tiles.order, v_gaussians)
-        v = torch.from_numpy(v_gaussians).reshape(*means2d.shape[:2], -1)
+        v = torch.from_numpy(v_gaussians).reshape(*means2d.shape[:2], 8 + render.shape[-1])
         if absgrad:
             means2d.absgrad = v[..., 2:4]
         v_backgrounds = np.einsum("chw,chwd->cd", transmittance, v_render)
