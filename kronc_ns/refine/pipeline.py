@@ -178,8 +178,11 @@ def _taken(
         )
     kept = inlier & np.array([report.status is ViewStatus.SOLVED for report in reports])[:, None]
     of_solved = error[kept.any(1)]
+    solved = sum(report.status is ViewStatus.SOLVED for report in reports)
+    reason = f"{solved} of {len(scene)} views solved by image features; by keypoints alone {solution.reason}"
     return replace(
         refined,
+        reason=reason if solution.status is Status.CONVERGED else solution.reason,
         views=tuple(reports),
         depths=np.where(scene.seen & kept.any(1)[:, None], camera_z(c2w, points), math.nan),
         rmse_px=float(np.sqrt(np.square(error[kept]).mean())) if kept.any() else solution.rmse_px,

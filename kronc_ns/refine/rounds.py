@@ -1,5 +1,6 @@
 """Matching and adjustment in turns: features by the keypoints' poses, then by those that features lead to."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +27,9 @@ _HELD_OUT = 0.2  # share of the tracks that no fit sees
 _TRACKS_OF_VIEW = 400  # that are enough, once their places are those of patches
 _PAIRED = 20  # sightings of a view in tracks of three, below which its tracks of two count
 _HELD_SHARE = 0.1  # of the usual sightings of a view: fewer are as likely wrong, and keypoints place it better
-_ROUNDS, _SETTLED_DEG = 6, 0.05  # of matching by the poses of features: until these turn less, on average
+_ROUNDS, _SETTLED_DEG, _SETTLED_SIGMAS = 6, 0.05, 8.0  # of matching by the poses of features, until these turn less on
+# average, or less than so many times the noise of a feature: then they only follow it
+_FOR_FOCAL = 50  # tracks of a view that are enough to see whether the focal length is right
 
 
 @dataclass(frozen=True)
@@ -114,11 +117,13 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
             return None
         latest = adjust(believed, known, aligned, latest.rig, config)
         turned = latest.rig.rotation @ earlier.rotation.transpose(0, 2, 1)
-        if rotation_angle_deg(turned).mean() < _SETTLED_DEG:
+        noise_deg = math.degrees(latest.sigma_px / latest.rig.focal)
+        if rotation_angle_deg(turned).mean() < max(_SETTLED_DEG, _SETTLED_SIGMAS * noise_deg):
             break
-    evidence = weigh(reserved, aligned, keypoints, start, latest.rig, latest.sigma_px)
+    evidence = weigh(reserved, known, aligned, keypoints, start, latest.rig, latest.sigma_px)
     if not config.refine_focal:
-        freed = adjust(believed, known, aligned, latest.rig, replace(config, refine_focal=True), latest.sigma_px)
+        some = enough(known, aligned.view, _FOR_FOCAL, rng)
+        freed = adjust(believed, some, aligned, latest.rig, replace(config, refine_focal=True), latest.sigma_px)
         evidence = replace(evidence, focal_growth=freed.rig.focal / latest.rig.focal)
     final = adjust(believed, _placed(tracks, aligned, latest), aligned, latest.rig, config, latest.sigma_px)
     return Found(final, believed, evidence)

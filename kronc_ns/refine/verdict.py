@@ -22,6 +22,8 @@ _MOST_KEYPOINTS_Z, _MOST_VIEW_SIGMAS, _MOST_BAD_VIEWS = 6.0, 5.0, 0.2
 """Of the rise of the keypoints' chi-square: of all; of one view; the share of views that may exceed that."""
 _LEAST_TRACKS, _LEAST_LONG = 10, 10
 """Held-out tracks that must be met, before or after; and how many of three views."""
+_HELD_BY, _MOST_LOOSE = 10, 0.4
+"""Sightings in tracks of three views that hold a view; the share of views that may have fewer."""
 _MOST_FOCAL = 0.03
 """Growth of a focal length that is held fixed, past which all poses are bent to suit it."""
 _FITS_SIGMAS, _FITS_PX = 3.0, 0.3
@@ -47,6 +49,8 @@ class Evidence:
     bad_views: int
     """Views whose keypoints are met so much worse that it is no chance."""
     views: int
+    loose_views: int
+    """Views of which hardly any feature is seen from two others."""
     focal_growth: float = 1.0
     """By how much the features would have the focal length grow where it is held fixed."""
 
@@ -58,6 +62,8 @@ class Evidence:
                 f"too few features are seen from three views ({self.held_long} of the tracks held out, "
                 f"{_LEAST_LONG} are needed)"
             )
+        if self.loose_views > _MOST_LOOSE * self.views:
+            return f"features hold only {self.views - self.loose_views} of {self.views} views together"
         if not self.held_z > _LEAST_Z:
             return (
                 f"tracks that were held out are not met better ({self.held_before_px:.2f} px before, "
@@ -76,9 +82,16 @@ class Evidence:
 
 
 def weigh(
-    held: Tracks, gathered: Gathered, keypoints: KeypointTracks, before: Rig, after: Rig, sigma_px: float
+    held: Tracks,
+    fitted: Tracks,
+    gathered: Gathered,
+    keypoints: KeypointTracks,
+    before: Rig,
+    after: Rig,
+    sigma_px: float,
 ) -> Evidence:
-    """Compare two sets of poses; ``sigma_px`` is the features' noise."""
+    """Compare two sets of poses, by tracks that were held out; ``sigma_px`` is the features' noise."""
+    seen = np.bincount(gathered.view[fitted.chosen(fitted.lengths >= 3).feature], minlength=len(after.rotation))
     residual = [_residuals(held, gathered, rig) for rig in (before, after)]
     limit = max(_FITS_SIGMAS * sigma_px, _FITS_PX)
     met = (residual[0] < limit) | (residual[1] < limit)
@@ -97,7 +110,8 @@ def weigh(
         held_z=_signed_rank_z(gain) if len(gain) >= _LEAST_TRACKS else 0.0,
         keypoints_z=float((others - expected).sum() / (spread * math.sqrt(max(len(others), 1)))),
         bad_views=int(bad.sum()),
-        views=len(rise),
+        views=len(after.rotation),
+        loose_views=int((seen < _HELD_BY).sum()),
     )
 
 
