@@ -125,6 +125,19 @@ def _walk_rows(walks: Sequence[Path]) -> list[Row]:
             {"mean": _SHOWN},
         ),
         Row(
+            "walk, bare photos",
+            "all photos and nothing else: the points that the detector finds, the focal length 20 % wrong and refined",
+            count,
+            partial(_measure, walks, detect=True, focal=1.2),
+            (
+                Limit("rotation_deg", at_most=0.015),
+                Limit("centre_cm", at_most=0.2),
+                Limit("focal_percent", "worst", at_most=0.2),
+                _TAKEN,
+            ),
+            {"mean": (*_SHOWN, "registered")},
+        ),
+        Row(
             "vehicle alone",
             "white around it",
             count,
