@@ -105,13 +105,7 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
         counter.expect(len(search.pairs) - planned)
         planned = 0
         believed = keypoints.noisier(alike(keypoints, start, latest.rig))
-        tracks = find_tracks(gathered, search, latest.rig, believed, latest)
-        tracks = enough(tracks, gathered.view, _TRACKS_OF_VIEW, rng)
-        aligned = align(tracks, gathered, latest.rig)
-        tracks = _placed(tracks, aligned, latest)
-        tracks, aligned = grow(tracks, aligned, latest.rig)
-        tracks = confirmed(tracks, aligned.view, _PAIRED)
-        tracks = of_held_views(tracks, aligned.view, _HELD_SHARE)
+        tracks, aligned = _matched(gathered, search, latest, believed, rng)
         known = _without(tracks, np.pad(held, (0, len(aligned.view) - len(held))))
         if not len(known):
             return None
@@ -127,6 +121,18 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
         evidence = replace(evidence, focal_growth=freed.rig.focal / latest.rig.focal)
     final = adjust(believed, _placed(tracks, aligned, latest), aligned, latest.rig, config, latest.sigma_px)
     return Found(final, believed, evidence)
+
+
+def _matched(
+    gathered: Gathered, search: Search, latest: Adjusted, believed: KeypointTracks, rng: np.random.Generator
+) -> tuple[Tracks, Gathered]:
+    """Tracks by the latest poses, and the features with their places made those of patches."""
+    tracks = find_tracks(gathered, search, latest.rig, believed, latest)
+    tracks = enough(tracks, gathered.view, _TRACKS_OF_VIEW, rng)
+    aligned = align(tracks, gathered, latest.rig)
+    tracks, aligned = grow(_placed(tracks, aligned, latest), aligned, latest.rig)
+    tracks = confirmed(tracks, aligned.view, _PAIRED)
+    return of_held_views(tracks, aligned.view, _HELD_SHARE), aligned
 
 
 def _angles(rig: Rig) -> Float[np.ndarray, "n n"]:
