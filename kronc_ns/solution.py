@@ -86,7 +86,7 @@ class ImageEvidence:
     held_out_z: float
     """By how many standard deviations they are met better (Wilcoxon)."""
     keypoints_z: float
-    """By how many standard deviations the keypoints' chi-square rises beyond what is expected."""
+    """By how many standard deviations the keypoints' chi-square rises beyond what detections that err alike explain."""
     noise_px: float | None
     """Of features along one axis."""
     focal_before_px: float
