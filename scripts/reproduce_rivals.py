@@ -5,7 +5,8 @@ Small, at most 90 minutes on two quiet cores (40 photos of 100x100, three starts
 
     scripts/reproduce_rivals.py --output-dir rivals
 
-In full, on a GPU (100 photos of 400x400, the paper's six starts, the papers' 200,000 steps):
+In full, on a GPU (100 photos of 400x400, the paper's six starts, the papers' 200,000 steps of 0.4 TFLOP: by that some
+two hours for each run of barf and l2g-nerf at 10 TFLOP/s, a day for all twelve; estimated, not measured):
 
     scripts/reproduce_rivals.py --output-dir rivals_full --gpu True --views 125 --width 400 \
         --noise 4 0.5 5 0.7 5 1.5 6 2 6 2.5 7 3
