@@ -22,7 +22,7 @@ _MOST_KEYPOINTS_Z, _MOST_VIEW_SIGMAS, _MOST_BAD_VIEWS = 6.0, 5.0, 0.2
 """Of the rise of the keypoints' chi-square: of all; of one view; the share of views that may exceed that."""
 _LEAST_TRACKS, _LEAST_LONG = 10, 10
 """Held-out tracks that must be met, before or after; and how many of three views."""
-_HELD_BY, _MOST_LOOSE = 10, 0.4
+_HELD_BY, _MOST_LOOSE = 10, 0.25
 """Sightings in tracks of three views that hold a view; the share of views that may have fewer."""
 _MOST_FOCAL = 0.03
 """Growth of a focal length that is held fixed, past which all poses are bent to suit it."""
