@@ -21,7 +21,7 @@ from kronc_ns.refine.pictures import Pictures
 from kronc_ns.refine.placement import placed
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.rounds import Found, Prepared, find_poses, prepare
-from kronc_ns.refine.tracks import Tracks
+from kronc_ns.refine.tracks import Tracks, long_sightings
 from kronc_ns.refine.uncertainty import pose_sigmas
 from kronc_ns.refine.verdict import Evidence
 from kronc_ns.scene import Scene
@@ -152,8 +152,7 @@ def _taken(
     )
     back = frame.inverse
     rig = adjusted.rig.moved(back)
-    long = adjusted.tracks.lengths >= 3
-    sightings = np.bincount(gathered.view[adjusted.tracks.chosen(long).feature], minlength=len(views))
+    sightings = long_sightings(adjusted.tracks, gathered.view, len(views))
     distance = np.linalg.norm(adjusted.rig.cameras.centre - np.nanmean(adjusted.rig.keypoints, axis=0), axis=1)
     sure = (sigma_rot <= _SURE_DEG) & (sigma_centre <= _SURE_SHARE * distance) & (sightings >= _SOLVED_BY)
     known = sure | solution.posed[views]

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.rig import Rig
+from kronc_ns.refine.tracks import long_sightings
 
 _LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewhere
 _RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricter
@@ -27,9 +28,8 @@ def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"
 
     ``used`` are the features that may be matched.
     """
-    tracks, rig = adjusted.tracks, adjusted.rig
-    long = tracks.chosen(tracks.lengths >= 3)
-    sightings = np.bincount(adjusted.gathered.view[long.feature], minlength=len(rig.rotation))
+    rig = adjusted.rig
+    sightings = long_sightings(adjusted.tracks, adjusted.gathered.view, len(rig.rotation))
     loose = np.flatnonzero(sightings < _LOOSE * np.median(sightings))
     rotation, translation = rig.rotation.copy(), rig.translation.copy()
     for view in loose.tolist():
@@ -75,10 +75,13 @@ def _matched(
     point = tracks.of_track[used]
     if not len(own) or not len(point):
         return np.empty((0, 3)), np.empty((0, 2))
+    point, begin = np.unique(point, return_index=True)  # sightings of a point stand together
     alike = seen.descriptor[own] @ gathered.descriptor[tracks.feature[used]].T
-    best = alike.argmax(1)
-    first = alike[np.arange(len(own)), best]
-    second = np.where(point == point[best][:, None], -1.0, alike).max(1)
+    alike = np.maximum.reduceat(alike, begin, axis=1)
+    each, best = np.arange(len(own)), alike.argmax(1)
+    first = alike[each, best]
+    alike[each, best] = -1.0
+    second = alike.max(1)
     distance, next_distance = (np.sqrt(np.maximum(2 - 2 * one, 0.0)) for one in (first, second))
     chosen = np.flatnonzero((distance < _RATIO * next_distance) & (first > _SIMILAR))
     chosen = chosen[np.argsort(-first[chosen], kind="stable")]

@@ -119,6 +119,11 @@ def enough(tracks: Tracks, view: Int[np.ndarray, "f"], least: int, rng: np.rando
     return tracks.chosen(_enough(tracks.first, view[tracks.feature], order, seen, least))
 
 
+def long_sightings(tracks: Tracks, view: Int[np.ndarray, "f"], views: int) -> Int[np.ndarray, "n"]:
+    """Each view's sightings in tracks of three views or more: those that others confirm."""
+    return np.bincount(view[tracks.feature[(tracks.lengths >= 3)[tracks.of_track]]], minlength=views)
+
+
 def confirmed(tracks: Tracks, view: Int[np.ndarray, "f"], least: int) -> Tracks:
     """Those of three views; and of two, until every view has ``least``, where it has fewer of three.
 
@@ -126,15 +131,14 @@ def confirmed(tracks: Tracks, view: Int[np.ndarray, "f"], least: int) -> Tracks:
     them back to where they were.
     """
     long = tracks.lengths >= 3
-    seen = np.bincount(view[tracks.chosen(long).feature], minlength=int(view.max(initial=0)) + 1)
+    seen = long_sightings(tracks, view, int(view.max(initial=0)) + 1)
     pairs = _enough(tracks.first, view[tracks.feature], np.flatnonzero(~long), seen, least)
     return tracks.chosen(long | pairs)
 
 
 def of_held_views(tracks: Tracks, view: Int[np.ndarray, "f"], share: float) -> Tracks:
     """The tracks less the sightings of views that have less than a share of the usual sightings in tracks of three."""
-    long = tracks.chosen(tracks.lengths >= 3)
-    seen = np.bincount(view[long.feature], minlength=int(view.max(initial=0)) + 1)
+    seen = long_sightings(tracks, view, int(view.max(initial=0)) + 1)
     keep = (seen >= share * np.median(seen))[view[tracks.feature]]
     left = rows_of(tracks.feature[keep], tracks.of_track[keep], tracks.points)
     return left.chosen(left.lengths >= 2)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.keypoints import MOST_ALIKE, POSE, KeypointTracks, chi_square
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import Tracks, place
+from kronc_ns.refine.tracks import Tracks, long_sightings, place
 
 _LEAST_Z = 3.0
 """Of the held-out tracks' test: chance alone passes it once in 700."""
@@ -91,7 +91,7 @@ def weigh(
     sigma_px: float,
 ) -> Evidence:
     """Compare two sets of poses, by tracks that were held out; ``sigma_px`` is the features' noise."""
-    seen = np.bincount(gathered.view[fitted.chosen(fitted.lengths >= 3).feature], minlength=len(after.rotation))
+    seen = long_sightings(fitted, gathered.view, len(after.rotation))
     residual = [_residuals(held, gathered, rig) for rig in (before, after)]
     limit = max(_FITS_SIGMAS * sigma_px, _FITS_PX)
     met = (residual[0] < limit) | (residual[1] < limit)

@@ -116,7 +116,7 @@ def test_photos_that_took_no_part_are_placed_and_others_are_not():
     more = ring(3)
     absent = features(more, known, rng, 0.2)
     strangers = features(more, rng.uniform([-2, -1, 0], [2, 1, 1.5], known.shape), np.random.default_rng(99), 0.2)
-    adjusted = Adjusted(rig, tracks, replace(gathered), 0.2, 0.2, 0.2)
+    adjusted = Adjusted(rig, tracks, gathered, 0.2, 0.2, 0.2)
     # their words are those of the points they show
     first = gathered.descriptor[: len(known)]
     absent = replace(absent, descriptor=np.tile(first, (3, 1)))
