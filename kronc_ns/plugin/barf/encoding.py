@@ -23,10 +23,14 @@ def frequency_weights(alpha: float, frequencies: int) -> Float[Tensor, "l"]:
 def encode(x: Float[Tensor, "*n d"], weights: Float[Tensor, "l"]) -> Float[Tensor, "*n e"]:
     """BARF's gamma(x; alpha): x, w_k sin(2^k pi x) and w_k cos(2^k pi x) for all k, e = d (1 + 2 l)."""
     octaves = math.pi * 2.0 ** torch.arange(len(weights), device=x.device).repeat(2)
+    # cosines as sines a quarter of a wave ahead, and all phases by one product of matrices: few passes over memory,
+    # there and, above all, back, where points are given a gradient
     quarter = (torch.arange(len(octaves), device=x.device) >= len(weights)) * (math.pi / 2)
-    # cosines as sines a quarter of a wave ahead: a single pass over memory, there and back
-    waves = (x[..., None, :] * octaves[:, None] + quarter[:, None]).sin() * weights.repeat(2)[:, None]
-    return torch.cat([x, waves.flatten(-2)], dim=-1)
+    one = torch.eye(x.shape[-1], device=x.device)
+    every = torch.kron(octaves[None], one).to(x)
+    phase = torch.addmm(quarter.repeat_interleave(x.shape[-1]).to(x), x.reshape(-1, x.shape[-1]), every)
+    waves = phase.sin() * weights.repeat(2).repeat_interleave(x.shape[-1])
+    return torch.cat([x, waves.reshape(*x.shape[:-1], phase.shape[-1])], dim=-1)
 
 
 def encoded_size(dimensions: int, frequencies: int) -> int:
