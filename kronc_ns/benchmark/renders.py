@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trimesh
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from kronc_ns.capture.detection.detector import CarImage, Detector
 from kronc_ns.synthetic.scenes import walk_poses
@@ -18,15 +18,19 @@ from kronc_ns.training.calibration import judged
 from kronc_ns.training.cameras import Shot, draw_shot
 from kronc_ns.training.lighting import draw_surroundings
 from kronc_ns.training.meshes import Surface, TexturedMesh
+from kronc_ns.training.procedural import draw_procedural
 from kronc_ns.training.rendering import render
 from kronc_ns.training.shards import Picture
 from kronc_ns.training.stage import Stage
 
 UNSEEN = ("porsche_911", "md_dino246")
 """Cars kept out of training."""
+DRAWN = ("sports", "mpv")
+"""Styles of procedural cars that came after version 1 of the weights."""
 WALK_FOCAL_PX = 420.0
 """Of the camera of `rendered_walk`."""
 _BINS = 10
+_VIEWS = 4  # of a drawn body
 
 
 @lru_cache(maxsize=2)
@@ -48,6 +52,17 @@ def unseen_pictures(cars: Path, count: int, seed: int) -> list[Picture]:
     rng, pictures = np.random.default_rng(seed), []
     for number in range(count):
         stage = _stage(cars / UNSEEN[number % len(UNSEEN)])
+        shot, around = draw_shot(rng, stage.bounds), draw_surroundings(rng, [])
+        pictures.append(render(stage, draw_look(rng, stage.body.mesh), around, shot))
+    return pictures
+
+
+def drawn_pictures(count: int, seed: int) -> list[Picture]:
+    """Procedural cars of the styles that version 1 of the weights was not trained on, drawn likewise."""
+    rng, pictures = np.random.default_rng(seed), []
+    for number in range(count):
+        if number % _VIEWS == 0:
+            stage = Stage(draw_procedural(rng, DRAWN[number // _VIEWS % len(DRAWN)]), rng)
         shot, around = draw_shot(rng, stage.bounds), draw_surroundings(rng, [])
         pictures.append(render(stage, draw_look(rng, stage.body.mesh), around, shot))
     return pictures
@@ -99,17 +114,22 @@ def save_all(pictures: Sequence[UInt8[np.ndarray, "h w 3"]], output: Path) -> li
     return files
 
 
-def calibration_error(detector: Detector, pictures: Sequence[Picture], output: Path) -> tuple[float, int]:
-    """Expected calibration error: how far the share of right points is from the confidence, over bins of equal width,
-    each weighted by its points; and how many points there were."""
+def judged_points(
+    detector: Detector, pictures: Sequence[Picture], output: Path
+) -> tuple[list[Float[np.ndarray, "_"]], list[Bool[np.ndarray, "_"]]]:
+    """Of each picture the confidence of the main car's points, and which of them are right."""
     files = save_all([picture.rgb for picture in pictures], output)
     said, right = [], []
     for cars, picture in zip(detector.detect([CarImage(file) for file in files]), pictures, strict=True):
-        for car in cars[:1]:
-            known, good, _ = judged(car, picture)
-            said.append(car.confidence[known])
-            right.append(good[known])
-    confidence, correct = np.concatenate(said), np.concatenate(right)
+        known, good, _ = judged(cars[0], picture) if cars else (np.zeros(0, dtype=bool),) * 3
+        said.append(cars[0].confidence[known] if cars else np.zeros(0))
+        right.append(good[known])
+    return said, right
+
+
+def calibration_error(confidence: Float[np.ndarray, "n"], right: Bool[np.ndarray, "n"]) -> float:
+    """Expected calibration error: how far the share of right points is from the confidence, over bins of equal width,
+    each weighted by its points."""
     bins = np.minimum((confidence * _BINS).astype(int), _BINS - 1)
-    gaps = [abs(confidence[bins == b].mean() - correct[bins == b].mean()) * (bins == b).mean() for b in np.unique(bins)]
-    return float(sum(gaps)), len(confidence)
+    gaps = [abs(confidence[bins == b].mean() - right[bins == b].mean()) * (bins == b).mean() for b in np.unique(bins)]
+    return float(sum(gaps))

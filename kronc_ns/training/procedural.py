@@ -137,19 +137,18 @@ class _Skin:
         return Part(self.vertices[used], self.normals[used], faces.reshape(-1, 3), name)
 
 
-def draw_procedural(rng: np.random.Generator) -> Body:
-    """A car of any style, deformed like the meshes, painted."""
+def draw_procedural(rng: np.random.Generator, style: str | None = None) -> Body:
+    """A car of a style (default: of any), deformed like the meshes, painted."""
     while True:
-        body = _draw_plain(rng)
+        body = _draw_plain(style or str(rng.choice(list(_STYLES), p=_shares())), rng)
         if body is not None:
             break
     shaped = deform(body, Proportions.draw(rng)) if rng.uniform() < 0.8 else body
     return painted(shaped, _PAINTED, rng)
 
 
-def _draw_plain(rng: np.random.Generator) -> Body | None:
+def _draw_plain(style: str, rng: np.random.Generator) -> Body | None:
     """A body without decals; None where the proportions leave no room for a feature."""
-    style = str(rng.choice(list(_STYLES), p=_shares()))
     shape = _draw_shape(style, rng)
     try:
         features = draw_features(shape, rng.uniform() < _TWO_DOORS.get(style, 0.0), rng)

@@ -17,7 +17,7 @@ from kronc_ns.benchmark.photos import (
     turn_steps,
     wheel_errors,
 )
-from kronc_ns.benchmark.renders import calibration_error, without_car
+from kronc_ns.benchmark.renders import calibration_error, judged_points, without_car
 from kronc_ns.benchmark.suites.detector import detector_rows
 from kronc_ns.capture.detection.detector import CarDetection
 from kronc_ns.files.output import write_json
@@ -153,12 +153,10 @@ def test_calibration_error_of_what_is_known(tmp_path):
         shown[:, 2] = 0.8
         pictures.append(Picture(np.zeros((352, 480, 3), np.uint8), mask, truth))
         rows.append(shown)
-    error, points = calibration_error(_Oracle(rows), pictures, tmp_path)
-    assert points == 40 * 66
-    assert error < 0.03
-    for shown in rows:
-        shown[:, 2] = 1.0
-    assert calibration_error(_Oracle(rows), pictures, tmp_path)[0] == pytest.approx(0.2, abs=0.03)
+    said, right = (np.concatenate(part) for part in judged_points(_Oracle(rows), pictures, tmp_path))
+    assert len(said) == 40 * 66
+    assert calibration_error(said, right) < 0.03
+    assert calibration_error(np.ones_like(said), right) == pytest.approx(0.2, abs=0.03)
 
 
 def test_pictures_without_a_car_are_drawn():
@@ -172,5 +170,10 @@ def test_rows_of_what_is_missing_are_left_out(tmp_path):
     weights = builtin_net(tmp_path)
     (tmp_path / "photos").mkdir()
     rows, missing = detector_rows(tmp_path / "photos", weights)
-    assert {row.name for row in rows} == {"no car: surroundings", "no car: object", "time and memory"}
+    assert {row.name for row in rows} == {
+        "no car: surroundings",
+        "no car: object",
+        "calibration: drawn cars",
+        "time and memory",
+    }
     assert len(missing) == 7
