@@ -27,6 +27,7 @@ from kronc_ns.fit.starts import (
     start_from_template,
     usable_views,
 )
+from kronc_ns.fit.two_cars import two_cars
 from kronc_ns.fit.unsolved import unsolved
 from kronc_ns.fit.verdict import Evidence, judge
 from kronc_ns.geometry.alignment import Similarity, umeyama
@@ -270,6 +271,7 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig, seconds: float)
         converged=attempt.converged,
         iterations=attempt.iterations,
         noise=attempt.noise,
+        two_cars=two_cars(attempt),
     )
     verdict = judge(found.scene, evidence)
     solved, views = verdict.solved, verdict.views

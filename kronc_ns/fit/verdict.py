@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from kronc_ns.fit.attempts import agrees
 from kronc_ns.fit.noise import Noise
 from kronc_ns.fit.starts import MIN_POINTS
+from kronc_ns.fit.two_cars import TwoCars
 from kronc_ns.geometry.camera import Camera, reproject
 from kronc_ns.geometry.poses import posed, unit
 from kronc_ns.scene import Scene
@@ -21,6 +22,9 @@ POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
 _NOISY = 0.006
 """Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
+_TWO_CARS = 0.4
+"""Share of the squared residuals that two shapes explain, from which on they are two: the habits of a detector come to
+0.25, two cars to 0.5 to 0.8."""
 _LEAST_FREEDOM = 10
 """Measurements beyond the unknowns without which a fit tells nothing of its noise."""
 _SURE_DEG, _SURE_SHARE = 2.0, 0.03
@@ -61,6 +65,8 @@ class Evidence:
     iterations: int
     noise: Noise
     """Of the detections."""
+    two_cars: TwoCars
+    """What two shapes would explain."""
 
 
 @dataclass(frozen=True)
@@ -204,6 +210,13 @@ def _overall(
     if evidence.noise.sigma_px > _NOISY * _diagonal(scene):
         problems.append(
             f"the keypoints fit poorly (noise {evidence.noise.sigma_px:.1f} px): are they all of one car, and right?"
+        )
+    if evidence.two_cars.explained > _TWO_CARS:
+        other = np.flatnonzero(evidence.two_cars.other)
+        explained = f"two shapes explain {100 * evidence.two_cars.explained:.0f} % of what one misses"
+        problems.append(
+            f"about {len(other)} of {views} views, {scene.names[other[0]]} the first, seem to show another car than "
+            f"the rest ({explained}): give one car at a time"
         )
     if 2 * count < views:
         problems.append(f"only {count} of {views} views are solved")

@@ -10,6 +10,7 @@ from kronc_ns.fit.completion import complete
 from kronc_ns.fit.noise import Noise
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
+from kronc_ns.fit.two_cars import TwoCars
 from kronc_ns.fit.verdict import Evidence, judge
 from kronc_ns.geometry.alignment import pose_errors
 from kronc_ns.geometry.poses import posed
@@ -80,6 +81,7 @@ def evidence_of(solution: Solution) -> Evidence:
         iterations=10,
         lead=np.full(len(solution.views), np.inf),
         noise=Noise(1.0, 1.0, 500),
+        two_cars=TwoCars(0.0, np.zeros(len(solution.views), dtype=bool)),
     )
 
 

@@ -11,6 +11,7 @@ from kronc_ns.fit.attempts import measured
 from kronc_ns.fit.noise import Noise
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
+from kronc_ns.fit.two_cars import TwoCars
 from kronc_ns.fit.verdict import POOR_FIT, Evidence, inliers, judge, residuals_px
 from kronc_ns.geometry.camera import reproject
 from kronc_ns.scene import Scene
@@ -37,6 +38,7 @@ def evidence(lap) -> Evidence:
         iterations=12,
         lead=np.full(VIEWS, math.inf),
         noise=Noise(0.7, 1.0, 500),
+        two_cars=TwoCars(0.0, np.zeros(VIEWS, dtype=bool)),
     )
 
 
