@@ -30,6 +30,9 @@ _LEAST_FREEDOM = 10
 _SURE_DEG, _SURE_SHARE = 2.0, 0.03
 """Most standard deviation of a solved view's rotation, and of its centre as a share of the distance: with more, errors
 of 5 degrees are no rarity."""
+_TYPICAL_DEG = 1.5
+"""Most root mean square of the solved views' standard deviations of rotation: errors of few views are largely one, so
+that with more a mean error of 3 degrees is no rarity."""
 _LEAST_LEAD = 3.0
 """Detections by which a solved view's pose is better than any other."""
 _LEAST_SOLVED = 0.25
@@ -226,6 +229,10 @@ def _overall(
         problems.append(
             f"only {sure} of {views} views are well determined (median standard deviation {typical:.1f} deg): "
             "take more views, or from nearer"
+        )
+    elif (typical := float(np.sqrt(np.square(evidence.sigma_rot_deg[solved]).mean()))) > _TYPICAL_DEG:
+        problems.append(
+            f"the {sure} solved of {views} views are known to {typical:.1f} deg only: take more views, or from nearer"
         )
     if count > 1 and (_parallax_deg(evidence, agreeing) < _PARALLAX_DEG or _all_alike(scene, agreeing)):
         problems.append("all views are from the same place: take them from around the object")

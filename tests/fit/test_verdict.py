@@ -201,6 +201,8 @@ def test_views_without_enough_agreement_say_so(scene, evidence):
         ({}, {"sigma_rot_deg": np.full(VIEWS, 8.0)}, Status.WEAK, "0 of 20 views are well determined"),
         ({}, {"sigma_rot_deg": np.full(VIEWS, 8.0)}, Status.WEAK, "8.0 deg): take more views"),
         ({}, {"sigma_rot_deg": np.full(VIEWS, math.nan)}, Status.WEAK, "well determined"),
+        ({}, {"sigma_rot_deg": np.full(VIEWS, 1.7)}, Status.WEAK, "known to 1.7 deg only: take more views"),
+        ({}, {"sigma_rot_deg": np.array([0.3] * 12 + [1.9] * 8)}, Status.CONVERGED, "20 of 20 views solved"),
         ({}, {"converged": False}, Status.WEAK, "still moving after 12 steps"),
         ({}, {"noise": Noise(3.5, 1.0, 500)}, Status.WEAK, "fit poorly (noise 3.5 px)"),
         ({}, {"noise": Noise(0.7, 1.1, 9)}, Status.WEAK, "share so few keypoints"),
