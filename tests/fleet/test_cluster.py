@@ -117,7 +117,7 @@ def test_ctrl_c_keeps_what_is_done(cluster, many, same, tmp_path, rows, kronc_fl
     out, scratch = tmp_path / "out", tmp_path / "scratch"
     arguments = ("--captures", many, "--output", out, "--ray", cluster, "--reports", "none", "--scratch", scratch)
     driver = subprocess.Popen(fleet_command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    _until(lambda: any(out.glob("fleet.parquet/*.parquet")))
+    _until(lambda: len([*out.glob("c*/fleet.json")]) > MANY // 4)
     driver.send_signal(signal.SIGINT)
     _, said = driver.communicate(timeout=60)
     assert (driver.returncode, said.count("\n")) == (130, 1), said
