@@ -51,9 +51,7 @@ def unseen_pictures(cars: Path, count: int, seed: int) -> list[Picture]:
     """The cars kept out of training from anywhere, in any paint and place, as training pictures are drawn."""
     rng, pictures = np.random.default_rng(seed), []
     for number in range(count):
-        stage = _stage(cars / UNSEEN[number % len(UNSEEN)])
-        shot, around = draw_shot(rng, stage.bounds), draw_surroundings(rng, [])
-        pictures.append(render(stage, draw_look(rng, stage.body.mesh), around, shot))
+        pictures.append(_picture(_stage(cars / UNSEEN[number % len(UNSEEN)]), rng))
     return pictures
 
 
@@ -63,9 +61,14 @@ def drawn_pictures(count: int, seed: int) -> list[Picture]:
     for number in range(count):
         if number % _VIEWS == 0:
             stage = Stage(draw_procedural(rng, DRAWN[number // _VIEWS % len(DRAWN)]), rng)
-        shot, around = draw_shot(rng, stage.bounds), draw_surroundings(rng, [])
-        pictures.append(render(stage, draw_look(rng, stage.body.mesh), around, shot))
+        pictures.append(_picture(stage, rng))
     return pictures
+
+
+def _picture(stage: Stage, rng: np.random.Generator) -> Picture:
+    """A car from anywhere, in any paint and place."""
+    shot, around = draw_shot(rng, stage.bounds), draw_surroundings(rng, [])
+    return render(stage, draw_look(rng, stage.body.mesh), around, shot)
 
 
 def without_car(kind: str, seed: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -119,11 +122,11 @@ def judged_points(
 ) -> tuple[list[Float[np.ndarray, "_"]], list[Bool[np.ndarray, "_"]]]:
     """Of each picture the confidence of the main car's points, and which of them are right."""
     files = save_all([picture.rgb for picture in pictures], output)
-    said, right = [], []
-    for cars, picture in zip(detector.detect([CarImage(file) for file in files]), pictures, strict=True):
-        known, good, _ = judged(cars[0], picture) if cars else (np.zeros(0, dtype=bool),) * 3
-        said.append(cars[0].confidence[known] if cars else np.zeros(0))
-        right.append(good[known])
+    said, right = [np.zeros(0)] * len(files), [np.zeros(0, dtype=bool)] * len(files)
+    for i, cars in enumerate(detector.detect([CarImage(file) for file in files])):
+        for car in cars[:1]:
+            known, good, _ = judged(car, pictures[i])
+            said[i], right[i] = car.confidence[known], good[known]
     return said, right
 
 

@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from kronc_ns.fit.attempts import Attempt
 from kronc_ns.geometry.poses import unit
-from kronc_ns.solve.problem import Problem, State
+from kronc_ns.solve.problem import Problem
 from kronc_ns.solve.projection import pixel, pixel_by_plane, plane_by_point, plane_by_shift, plane_by_turn
 
 _EXACT = 0.0005
@@ -56,30 +56,23 @@ class _Seen(NamedTuple):
 
 def two_cars(attempt: Attempt) -> TwoCars:
     """What two shapes, each of some of the views, explain of the residuals of a fit by one."""
-    problem, state, sigma_px = attempt.problem, attempt.state, attempt.noise.sigma_px
-    camera = attempt.found.scene.camera
+    sigma_px, camera = attempt.noise.sigma_px, attempt.found.scene.camera
     views, points = np.flatnonzero(attempt.inlier.any(1)), np.flatnonzero(attempt.inlier.sum(0) >= 2)
     other = np.zeros(len(attempt.inlier), dtype=bool)
     freedom = 2 * int(attempt.inlier[:, points].sum()) - 6 * len(views) - 3 * len(points)
     of_detector = _EXACT * math.hypot(camera.width, camera.height) < sigma_px < math.inf
     if not of_detector or not len(points) or freedom < _FREEDOM * len(points):
         return TwoCars(0.0, other)
-    if _likeness(problem, state, views, points, attempt.inlier) < _ALIKE:
+    if _likeness(attempt, views, points) < _ALIKE:
         return TwoCars(0.0, other)
-    seen = _seen(problem, state, views, points, attempt.inlier)
-    explained, side = _split(problem, state, views, points, seen, sigma_px)
+    explained, side = _split(attempt, views, points)
     by_chance = 3 * len(points) / (freedom + 3 * len(points))
     other[views] = side == (1 if 2 * (side > 0).sum() <= len(views) else -1)
     return TwoCars(max(explained - by_chance, 0.0) / (1 - by_chance) if other.any() else 0.0, other)
 
 
-def _seen(
-    problem: Problem,
-    state: State,
-    views: Int[np.ndarray, "m"],
-    points: Int[np.ndarray, "k"],
-    inlier: Bool[np.ndarray, "n j"],
-) -> _Seen:
+def _seen(attempt: Attempt, views: Int[np.ndarray, "m"], points: Int[np.ndarray, "k"]) -> _Seen:
+    problem, state, inlier = attempt.problem, attempt.state, attempt.inlier
     lens = np.zeros(len(inlier), dtype=int) if problem.lens is None else problem.lens
     growth, k1 = (np.atleast_1d(x)[lens[views]][:, None] for x in (np.exp(state.log_growth), state.k1))
     fx, fy = problem.focal[0] * growth, problem.focal[1] * growth
@@ -93,21 +86,16 @@ def _seen(
     return _Seen((u, v, near), (fx, fy, k1), root, residual)
 
 
-def _likeness(
-    problem: Problem,
-    state: State,
-    views: Int[np.ndarray, "m"],
-    points: Int[np.ndarray, "k"],
-    inlier: Bool[np.ndarray, "n j"],
-) -> float:
+def _likeness(attempt: Attempt, views: Int[np.ndarray, "m"], points: Int[np.ndarray, "k"]) -> float:
     """How much more the residuals of some views and of their nearest views are alike, up to the sign, than noise is."""
+    state = attempt.state
     centre = state.points[points].mean(0)
     towards = unit(-(state.translation[views, None] @ state.rotation[views])[:, 0] - centre)
     some = np.linspace(0, len(views) - 1, min(len(views), _SAMPLED)).astype(int)
     closeness = towards[some] @ towards.T
     closeness[np.arange(len(some)), some] = -math.inf
     nearest = closeness.argmax(1)
-    one, other = (_seen(problem, state, views[of], points, inlier) for of in (some, nearest))
+    one, other = (_seen(attempt, views[of], points) for of in (some, nearest))
     both = (one.root > 0) & (other.root > 0)
     here, there = (np.where(both[..., None], of.residual, 0.0).reshape(len(some), -1) for of in (one, other))
     squares = np.square(here).sum(1) * np.square(there).sum(1)
@@ -116,15 +104,11 @@ def _likeness(
 
 
 def _split(
-    problem: Problem,
-    state: State,
-    views: Int[np.ndarray, "m"],
-    points: Int[np.ndarray, "k"],
-    seen: _Seen,
-    sigma_px: float,
+    attempt: Attempt, views: Int[np.ndarray, "m"], points: Int[np.ndarray, "k"]
 ) -> tuple[float, Float[np.ndarray, "m"]]:
     """The share of the squared residuals that two shapes explain, and which views are of which (1 or -1)."""
-    by_camera, by_point = _derivatives(state.rotation[views], seen)
+    seen = _seen(attempt, views, points)
+    by_camera, by_point = _derivatives(attempt.state.rotation[views], seen)
     count, size = len(views), 3 * len(points)
     across, stretch, _ = np.linalg.svd(by_camera.reshape(count, -1, 6), full_matrices=False)
     across = across * (stretch > _FLAT * stretch[:, :1])[:, None]
@@ -134,7 +118,9 @@ def _split(
     shared = np.einsum("mkab,mkac->kbmc", by_point, across.reshape(count, -1, 2, 6)).reshape(size, -1)
     own = np.zeros((len(points), 3, len(points), 3))
     own[np.arange(len(points)), :, np.arange(len(points))] = np.einsum("mkab,mkac->kbc", by_point, by_point)
-    information = own.reshape(size, size) - shared @ shared.T + sigma_px**2 * _prior(problem, points)
+    information = (
+        own.reshape(size, size) - shared @ shared.T + attempt.noise.sigma_px**2 * _prior(attempt.problem, points)
+    )
     factor = cho_factor(information, lower=True)
     whitened = solve_triangular(factor[0], gradient.T, lower=True)
     side = np.where(np.linalg.eigh(whitened.T @ whitened)[1][:, -1] < 0, -1.0, 1.0)
