@@ -24,7 +24,7 @@ _NOISY = 0.006
 """Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
 _TWO_CARS = 0.4
 """Share of the squared residuals that two shapes explain, from which on they are two: the habits of a detector come to
-0.25, two cars to 0.4 to 0.8, or less where they are so alike that the poses are those of either."""
+0.25, two cars mostly to 0.4 to 0.8."""
 _LEAST_FREEDOM = 10
 """Measurements beyond the unknowns without which a fit tells nothing of its noise."""
 _SURE_DEG, _SURE_SHARE = 2.0, 0.03
