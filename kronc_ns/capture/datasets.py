@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -20,8 +21,11 @@ from kronc_ns.files.images import read_mask
 from kronc_ns.files.keypoints import FORMATS, match_keypoints, read_keypoints, write_keypoints
 from kronc_ns.files.output import claim_output, read_json, release_output, write_json
 from kronc_ns.files.transforms import read_poses, transforms_dict
-from kronc_ns.geometry.camera import Camera
+from kronc_ns.geometry.camera import Camera, Lenses
 from kronc_ns.keypoints.schema import KeypointSchema
+
+if TYPE_CHECKING:
+    import pycolmap
 
 _COLMAP_FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse", "colmap", ".")
 _COLMAP_MODELS = {  # parameters of COLMAP's camera models, by our names
@@ -40,7 +44,8 @@ class Views:
     images: tuple[Path, ...]
     names: tuple[str, ...]
     """What keypoint files call them."""
-    camera: Camera
+    cameras: tuple[Camera, ...]
+    """Of each view."""
     c2w: Float[np.ndarray, "n 3 4"]
     """Trusted poses, OpenCV axes; NaN where a view has none."""
     schema: KeypointSchema
@@ -55,8 +60,8 @@ def import_dataset(data: Path, output: Path, splits: Sequence[str] = ("train", "
     CarPatch: ``transforms_SPLIT.json`` with ``camera_angle_x`` and camera-to-world matrices in OpenGL axes, images at
     their ``file_path`` (".png" is added), and for each split a keypoint file of any format that is read:
     ``keypoints_SPLIT.json``, ``SPLIT/keypoints.json``, or OpenPifPaf's predictions in ``SPLIT/``. The splits follow
-    one another. Otherwise ``images/`` (or ``frames/``), a COLMAP model of one camera in ``sparse/0``,
-    ``colmap/sparse/0`` or ``colmap``, keypoints in ``keypoints.json`` or ``keypoints/``, and optionally ``masks/``.
+    one another. Otherwise ``images/`` (or ``frames/``), a COLMAP model in ``sparse/0``, ``colmap/sparse/0`` or
+    ``colmap``, keypoints in ``keypoints.json`` or ``keypoints/``, and optionally ``masks/``.
     """
     if not data.is_dir():
         raise KroncError(f"{data} is no folder: expected a CarPatch scene, or images with a COLMAP model")
@@ -90,10 +95,10 @@ def _carpatch_split(data: Path, split: str) -> Views:
     if not isinstance(angle, int | float) or not 0 < angle < math.pi:
         raise KroncError(f"{file}: camera_angle_x is {angle}: expected the field of view in radians, as Blender has it")
     focal = width / 2 / math.tan(angle / 2)
-    camera = Camera(focal, focal, width / 2, height / 2, width, height)
+    cameras = (Camera(focal, focal, width / 2, height / 2, width, height),) * len(images)
     candidates = [data / f"keypoints_{split}.json", data / split / "keypoints.json", data / split]
-    schema, keypoints = _keypoints(candidates, names, camera)
-    return Views(images, names, camera, np.stack(list(poses.values())), schema, keypoints, None)
+    schema, keypoints = _keypoints(candidates, names, cameras)
+    return Views(images, names, cameras, np.stack(list(poses.values())), schema, keypoints, None)
 
 
 def _posed_by_colmap(data: Path) -> Views:
@@ -104,22 +109,18 @@ def _posed_by_colmap(data: Path) -> Views:
             f"{data} holds neither transforms_train.json (CarPatch) nor images/ or frames/: expected one of them"
         )
     names = tuple(image.name for image in images)
-    camera, poses = _read_colmap(data)
-    unknown = sorted(set(poses) - set(names))
-    if unknown:
-        raise KroncError(
-            f"the COLMAP model in {data} has {unknown[0]}, which is not among the images: expected its images"
-        )
-    if _size(images) != (camera.width, camera.height):
-        raise KroncError(
-            f"{images[0]} is {'x'.join(map(str, _size(images)))}, COLMAP's camera {camera.width}x{camera.height}: "
-            "expected the images that COLMAP was given"
-        )
+    cameras, poses = _read_colmap(data, names)
+    for image, camera in zip(images, cameras, strict=True):
+        if (size := upright_size(image)) != (camera.width, camera.height):
+            raise KroncError(
+                f"{image} is {size[0]}x{size[1]}, COLMAP's camera {camera.width}x{camera.height}: "
+                "expected the images that COLMAP was given"
+            )
     none = np.full((3, 4), np.nan)
     c2w = np.stack([poses.get(name, none) for name in names])
-    schema, keypoints = _keypoints([data / "keypoints.json", data / "keypoints", images[0].parent], names, camera)
+    schema, keypoints = _keypoints([data / "keypoints.json", data / "keypoints", images[0].parent], names, cameras)
     masks = _masks(data / "masks", names) if (data / "masks").is_dir() else None
-    return Views(images, names, camera, c2w, schema, keypoints, masks)
+    return Views(images, names, cameras, c2w, schema, keypoints, masks)
 
 
 def _masks(folder: Path, names: tuple[str, ...]) -> tuple[Path, ...]:
@@ -136,8 +137,8 @@ def _masks(folder: Path, names: tuple[str, ...]) -> tuple[Path, ...]:
     return tuple(file for file in found if file is not None)
 
 
-def _read_colmap(data: Path) -> tuple[Camera, dict[str, Float[np.ndarray, "3 4"]]]:
-    """The one camera of a COLMAP model and the poses (OpenCV c2w) of its registered images, by file name."""
+def _read_colmap(data: Path, names: Sequence[str]) -> tuple[tuple[Camera, ...], dict[str, Float[np.ndarray, "3 4"]]]:
+    """The camera of each image of these names, and the poses (OpenCV c2w) of those that have one, by name."""
     import zlib  # noqa: F401 - pycolmap >= 4.1 aborts the process where zlib comes after it
 
     import pycolmap
@@ -150,9 +151,28 @@ def _read_colmap(data: Path) -> tuple[Camera, dict[str, Float[np.ndarray, "3 4"]
         model = pycolmap.Reconstruction(str(folder))
     except (OSError, ValueError, RuntimeError) as error:
         raise KroncError(f"{folder} cannot be read as a COLMAP model: {error}") from None
-    if len(model.cameras) != 1:
-        raise KroncError(f"{folder} has {len(model.cameras)} cameras: expected one for all images (single_camera)")
-    (camera,) = model.cameras.values()
+    images = {PurePosixPath(image.name).name: image for image in model.images.values()}
+    unknown = sorted(set(images) - set(names))
+    if unknown:
+        raise KroncError(
+            f"the COLMAP model in {data} has {unknown[0]}, which is not among the images: expected its images"
+        )
+    cameras = {number: _camera_of(camera, folder) for number, camera in model.cameras.items()}
+    if not cameras:
+        raise KroncError(f"{folder} has no camera: expected a COLMAP model of the images")
+    unplaced = [name for name in names if name not in images]
+    if unplaced and len({*cameras.values()}) > 1:
+        raise KroncError(
+            f"{folder} has {len(cameras)} cameras and does not say which took {unplaced[0]}, which it has not placed: "
+            "leave that image out"
+        )
+    of_unplaced = next(iter(cameras.values()))
+    each = tuple(cameras[images[name].camera_id] if name in images else of_unplaced for name in names)
+    poses = {name: image.cam_from_world().inverse().matrix() for name, image in images.items() if image.has_pose}
+    return each, poses
+
+
+def _camera_of(camera: "pycolmap.Camera", folder: Path) -> Camera:
     kind = camera.model.name
     if kind not in _COLMAP_MODELS:
         raise KroncError(f"{folder}: camera model {kind} is not supported: expected {', '.join(_COLMAP_MODELS)}")
@@ -160,16 +180,11 @@ def _read_colmap(data: Path) -> tuple[Camera, dict[str, Float[np.ndarray, "3 4"]
     focal = values.pop("f", None)
     if focal is not None:
         values |= {"fx": focal, "fy": focal}
-    poses = {
-        PurePosixPath(image.name).name: image.cam_from_world().inverse().matrix()
-        for image in model.images.values()
-        if image.has_pose
-    }
-    return Camera(width=camera.width, height=camera.height, **values), poses
+    return Camera(width=camera.width, height=camera.height, **values)
 
 
 def _keypoints(
-    candidates: Sequence[Path], names: tuple[str, ...], camera: Camera
+    candidates: Sequence[Path], names: tuple[str, ...], cameras: Sequence[Camera]
 ) -> tuple[KeypointSchema, Float[np.ndarray, "n j 3"]]:
     """Schema and rows from the first candidate that is a keypoint file, or a folder of predictions."""
     for path in candidates:
@@ -177,7 +192,8 @@ def _keypoints(
             found = read_keypoints(path)
             if found.notes:  # a data set is published whole
                 raise KroncError(f"{'; '.join(found.notes)}: expected numbers, or confidence 0 for what is not seen")
-            return found.schema, match_keypoints(found, names, camera)[0]
+            sizes = [(camera.width, camera.height) for camera in cameras]
+            return found.schema, match_keypoints(found, names, cameras[0], sizes=sizes)[0]
     listed = ", ".join(map(str, candidates[:-1]))
     raise KroncError(f"no keypoints: expected {listed} or predictions in {candidates[-1]} ({FORMATS})")
 
@@ -199,10 +215,6 @@ def _joined(parts: Sequence[Views]) -> Views:
     """Several splits, one after the other."""
     first = parts[0]
     for part in parts[1:]:
-        if part.camera != first.camera:
-            raise KroncError(
-                f"{part.images[0]} and {first.images[0]} have different cameras: import one of --splits alone"
-            )
         if part.schema != first.schema:
             raise KroncError(
                 f"{len(first.schema)} keypoints for {first.images[0]}, {len(part.schema)} for {part.images[0]}: "
@@ -211,7 +223,7 @@ def _joined(parts: Sequence[Views]) -> Views:
     return Views(
         tuple(image for part in parts for image in part.images),
         tuple(name for part in parts for name in part.names),
-        first.camera,
+        tuple(camera for part in parts for camera in part.cameras),
         np.concatenate([part.c2w for part in parts]),
         first.schema,
         np.concatenate([part.keypoints for part in parts]),
@@ -225,16 +237,17 @@ def _write(output: Path, views: Views) -> None:
     stems = ["_".join(PurePosixPath(name).with_suffix("").parts) for name in views.names]
     names = [f"images/{stem}{file.suffix.lower()}" for stem, file in zip(stems, views.images, strict=True)]
     masks = [f"masks/{stem}.png" for stem in stems]
-    size = (views.camera.width, views.camera.height)
+    sizes = [(camera.width, camera.height) for camera in views.cameras]
     for i, (source, name) in enumerate(zip(views.images, names, strict=True)):
         image = copy_upright(source, output / name)
         if views.masks is not None:
-            Image.fromarray(read_mask(views.masks[i], size)).save(output / masks[i])
+            Image.fromarray(read_mask(views.masks[i], sizes[i])).save(output / masks[i])
         elif "A" in image.getbands():
             opaque = np.asarray(image.getchannel("A")) > 127
             Image.fromarray(np.where(opaque, 255, 0).astype(np.uint8)).save(output / masks[i])
     masked = masks if all((output / mask).exists() for mask in masks) else None
     rows = dict(zip(names, views.keypoints, strict=True))
-    write_keypoints(output / "keypoints.json", views.schema, size, rows)
-    write_json(output / "reference.json", transforms_dict(views.camera, names, views.c2w, masked))
-    write_json(output / "transforms.json", transforms_dict(views.camera, names, None, masked))
+    write_keypoints(output / "keypoints.json", views.schema, sizes[0] if len({*sizes}) == 1 else None, rows)
+    lenses = Lenses.of(views.cameras)
+    for file, poses in (("reference.json", views.c2w), ("transforms.json", None)):
+        write_json(output / file, transforms_dict(views.cameras[0], names, poses, masked, lenses=lenses))

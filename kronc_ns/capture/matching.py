@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from kronc_ns.capture.frames import Frames
-from kronc_ns.errors import KroncError
 from kronc_ns.files.keypoints import Detections, match_keypoints, sigma_of, under_file_names
 from kronc_ns.geometry.camera import Camera
 from kronc_ns.keypoints.schema import KeypointSchema
@@ -34,11 +33,6 @@ def match_frames(
 
     Those of photos that were left out are not needed; any other name is a `KroncError`.
     """
-    if found.size is not None and len({*frames.sizes}) > 1:
-        raise KroncError(
-            f"{found.source} is for images of {found.size[0]}x{found.size[1]}, here are {len({*frames.sizes})} sizes: "
-            "expected keypoints in the pixels of each image, and no width and height for all"
-        )
     for calling in (every_name, frames.names):
         found = under_file_names(found, calling)
     names = frames.names if _covers(frames.names, found) else frames.source_names

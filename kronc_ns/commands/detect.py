@@ -78,10 +78,10 @@ class Detect:
             found = find_cars(detector, [CarImage(image) for image in images], names, sizes, self.data, progress)
         instances, note = [found.frames[name] for name in names], ""
         if found.size is not None:
-            rows, note = select_instances(instances, found.size)
+            rows, note = select_instances(instances, [found.size] * len(instances))
         else:  # no walk around one car
             pairs = zip(instances, sizes, strict=True)
-            rows = np.concatenate([select_instances([cars], size)[0] for cars, size in pairs])
+            rows = np.concatenate([select_instances([cars], [size])[0] for cars, size in pairs])
         sigma = sigma_of(found, tuple(names), rows)
         file = self.output_dir / "keypoints.json"
         write_keypoints(file, detector.schema, found.size, dict(zip(names, rows, strict=True)), sigma)

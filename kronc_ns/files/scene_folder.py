@@ -49,11 +49,6 @@ def load_scene(folder: Path | str, keypoints: Path | None = None, keypoint_names
     if is_solution:
         left_out = left_out_views(folder)
         found = _without(under_file_names(found, (*names, *left_out)), left_out)
-    if lenses is not None and found.size is not None and any((c.width, c.height) != found.size for c in cameras):
-        raise KroncError(
-            f"{found.source} is for images of {found.size[0]}x{found.size[1]}, {file} has images of several sizes: "
-            "expected keypoints in the pixels of each image, and no width and height for all"
-        )
     mask_files = [folder / mask for mask in masks] if all(masks) and masks else None
     sizes = [(one.width, one.height) for one in cameras]
     rows, note = match_keypoints(found, names, camera, mask_files, sizes)

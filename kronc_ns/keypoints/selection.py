@@ -10,14 +10,14 @@ _SWITCH_WEIGHT = 2.0  # how much a jump of the car between neighbouring frames c
 
 def select_instances(
     instances: Sequence[Float[np.ndarray, "_ j 3"]],
-    size: tuple[int, int],
+    sizes: Sequence[tuple[int, int]],
     masks: Sequence[Integer[np.ndarray, "h w"] | None] | None = None,
 ) -> tuple[Float[np.ndarray, "n j 3"], str]:
     """The (u, v, confidence) rows of one car per frame, and a sentence that says what was chosen from.
 
-    ``instances`` are the cars found in each of the N frames, in capture order; ``size`` is (width, height);
-    ``masks`` are 0 outside the car. Each car scores the share of its points inside the mask or, without a mask,
-    its size and nearness to the image centre; a jump of place or size between frames costs. The best path
+    ``instances`` are the cars found in each of the N frames, in capture order; ``sizes`` are the frames' (width,
+    height); ``masks`` are 0 outside the car. Each car scores the share of its points inside the mask or, without a
+    mask, its size and nearness to the image centre; a jump of place or size between frames costs. The best path
     through all frames is found exactly (dynamic programming). A frame without any car gets rows of zeros.
     """
     instances = [rows[(rows[..., 2] > 0).any(1)] for rows in instances]  # without a point there is no car
@@ -25,9 +25,9 @@ def select_instances(
     chosen = np.zeros((len(instances), *instances[0].shape[1:]))
     if not filled:
         return chosen, "no car found in any image"
-    boxes = [_boxes(instances[i], size) for i in filled]
+    boxes = [_boxes(instances[i], sizes[i]) for i in filled]
     scores = [
-        _score(instances[i], box, size, masks[i] if masks else None) for i, box in zip(filled, boxes, strict=True)
+        _score(instances[i], box, sizes[i], masks[i] if masks else None) for i, box in zip(filled, boxes, strict=True)
     ]
 
     path = consistent_path(scores, boxes, filled)

@@ -118,6 +118,62 @@ def test_a_video_posed_by_colmap_comes_back_exactly(capture, video, tmp_path):
     check_masks(out, scene.masks)
 
 
+def test_splits_of_two_cameras(capture, carpatch, tmp_path):
+    change(carpatch / "transforms_test.json", camera_angle_x=0.5)
+    assert import_dataset(carpatch, tmp_path / "out") == VIEWS
+    lenses = load_scene(tmp_path / "out").lenses
+    assert lenses.of_view.tolist() == [0] * TRAIN + [1] * (VIEWS - TRAIN)
+    assert [camera.fx for camera in lenses.cameras] == pytest.approx([capture.camera.fx, 32 / math.tan(0.25)])
+
+
+@pytest.fixture
+def two_cameras(video) -> Path:
+    """The video with another camera, of a larger picture, for its last view."""
+    import zlib  # noqa: F401 - before pycolmap
+
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(video / "sparse" / "0"))
+    other = pycolmap.Camera(camera_id=7, model="PINHOLE", width=96, height=80, params=[90.0, 91.0, 48.0, 40.0])
+    wide = pycolmap.Reconstruction()
+    for camera in (*model.cameras.values(), other):
+        wide.add_camera_with_trivial_rig(camera)
+    for number, image in model.images.items():
+        own = other.camera_id if image.name == "video_00006.jpg" else image.camera_id
+        copy = pycolmap.Image(name=image.name, camera_id=own, image_id=number)
+        wide.add_image_with_trivial_frame(copy, image.cam_from_world())
+    wide.write_binary(str(video / "sparse" / "0"))
+    write_picture(video / "images" / "video_00006.jpg", 96, 80)
+    cv2.imwrite(str(video / "masks" / "video_00006.jpg.png"), np.full((80, 96), 255, np.uint8))
+    content = json.loads((video / "keypoints.json").read_text())
+    del content["width"], content["height"]
+    (video / "keypoints.json").write_text(json.dumps(content))
+    for kind in ("images/video_00003.jpg", "masks/video_00003.jpg.png"):  # which COLMAP has not placed
+        (video / kind).unlink()
+    content["frames"].pop(2)
+    (video / "keypoints.json").write_text(json.dumps(content))
+    return video
+
+
+def test_a_video_of_two_cameras(capture, two_cameras, tmp_path):
+    out = tmp_path / "out"
+    assert import_dataset(two_cameras, out) == VIEWS - 1
+    scene = load_scene(out)
+    assert scene.lenses.of_view.tolist() == [0] * (VIEWS - 2) + [1]
+    other = scene.lenses.cameras[1]
+    assert (other.fx, other.fy, other.cx, other.width, other.height) == (90.0, 91.0, 48.0, 96, 80)
+    poses = read_poses(out / "reference.json")
+    known = [i for i in range(VIEWS) if i != 2]
+    np.testing.assert_allclose(np.stack([poses[name] for name in scene.names]), capture.c2w[known], atol=1e-12, rtol=0)
+    assert cv2.imread(str(out / scene.masks[-1])).shape[:2] == (80, 96)
+
+
+def test_which_camera_took_an_image_that_colmap_has_not_placed_cannot_be_told(two_cameras, tmp_path):
+    write_picture(two_cameras / "images" / "video_00003.jpg", 64, 64)
+    with pytest.raises(KroncError, match=r"2 cameras and does not say which took video_00003\.jpg"):
+        import_dataset(two_cameras, tmp_path / "out")
+
+
 def change(file: Path, **values) -> None:
     file.write_text(json.dumps(json.loads(file.read_text()) | values))
 
@@ -142,7 +198,6 @@ BAD_CARPATCH = {
     "keypoints": (lambda f: (f / "keypoints_test.json").unlink(), r"no keypoints: expected .*keypoints_test\.json"),
     "image": (lambda f: (f / "test" / "r_1.png").unlink(), r"r_1\.png is no image"),
     "size": (lambda f: write_picture(f / "test" / "r_1.png"), r"64x64.*64x48: expected one camera and one size"),
-    "camera": (lambda f: change(f / "transforms_test.json", camera_angle_x=0.5), "different cameras"),
     "angle": (lambda f: change(f / "transforms_test.json", camera_angle_x=None), "camera_angle_x is None"),
     "keypoints' size": (lambda f: change(f / "keypoints_train.json", width=80), "80x64 images"),
     "schema": (five_points, "66 keypoints for .*, 5 for"),

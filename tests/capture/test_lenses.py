@@ -102,5 +102,5 @@ def test_every_mask_has_the_size_of_its_image(tmp_path):
 
 def test_a_size_for_all_keypoints_contradicts_images_of_several(tmp_path):
     found = Detections(tmp_path / "kp.json", APOLLOCAR3D_66, {}, WIDE, None)
-    with pytest.raises(KroncError, match="here are 2 sizes"):
+    with pytest.raises(KroncError, match="the camera says 2 sizes"):
         match_frames(found, FRAMES.source_names, FRAMES, Camera(500.0, 500.0, 320.0, 240.0, *WIDE))

@@ -107,5 +107,5 @@ def test_what_needs_one_camera_says_so(folder):
 
 def test_a_size_for_all_keypoints_contradicts_images_of_several(folder, edit):
     edit(folder / "keypoints.json", lambda content: content.update(width=480, height=270))
-    with pytest.raises(KroncError, match="images of several sizes"):
+    with pytest.raises(KroncError, match="the camera says 2 sizes"):
         load_scene(folder)

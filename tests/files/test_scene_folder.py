@@ -73,7 +73,7 @@ def frames(change):
         ("transforms.json", lambda c: c.update(frames=[]), "no frames"),
         ("transforms.json", lambda c: c.update(frames="x"), "expected .frames."),
         ("transforms.json", lambda c: c.update(camera_model="OPENCV_FISHEYE"), "not supported"),
-        ("transforms.json", lambda c: c["frames"][2].update(w=481), "images of several sizes"),
+        ("transforms.json", lambda c: c["frames"][2].update(w=481), "the camera says 2 sizes"),
         ("transforms.json", lambda c: c["frames"].append(c["frames"][0]), "listed twice"),
         ("transforms.json", lambda c: c["frames"][0].update(mask_path="masks/a.png"), "lacks a mask_path"),
         ("transforms.json", lambda c: c.update(w=640), "keypoints in the pixels"),

@@ -31,7 +31,11 @@ def read_coco(path: Path, content: dict[str, Any], names: KeypointSchema | None)
     try:
         categories = {c["id"]: c for c in content.get("categories", [])}
         images = {image["id"]: str(image["file_name"]) for image in content["images"]}
-        sizes = {(int(i["width"]), int(i["height"])) for i in content["images"] if {"width", "height"} <= i.keys()}
+        sizes = {
+            str(image["file_name"]): (int(image["width"]), int(image["height"]))
+            for image in content["images"]
+            if {"width", "height"} <= image.keys()
+        }
         annotations = [
             _Annotation(images[a["image_id"]], a.get("category_id"), a["keypoints"])
             for a in content["annotations"]
@@ -40,8 +44,6 @@ def read_coco(path: Path, content: dict[str, Any], names: KeypointSchema | None)
         used = _used(categories, annotations)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise KroncError(f"{path}: COCO field {error} is missing or of the wrong kind") from None
-    if len(sizes) > 1:
-        raise KroncError(f"{path}: images of {len(sizes)} sizes ({_some(sizes)}): expected one camera and one size")
     if len(used) > 1 and all(len(flat_numbers(a.keypoints, f"{path}, {a.image}")) == 3 for a in annotations):
         schema, instances = _points_of_categories(path, used, annotations, names)
     else:
@@ -51,8 +53,13 @@ def read_coco(path: Path, content: dict[str, Any], names: KeypointSchema | None)
     confident = from_flags(rows for _, rows in instances)
     for (image, _), rows in zip(instances, confident, strict=True):
         frames[image].append(from_pixel_indices(rows))
+    of_all = {*sizes.values()}
     return Detections(
-        path, schema, {name: stacked(rows, schema) for name, rows in frames.items()}, sizes.pop() if sizes else None
+        path,
+        schema,
+        {name: stacked(rows, schema) for name, rows in frames.items()},
+        size=of_all.pop() if len(of_all) == 1 else None,
+        sizes=sizes or None,
     )
 
 
@@ -108,8 +115,3 @@ def _points_of_categories(
         row = rows.setdefault(annotation.image, np.zeros((len(schema), 3)))
         row[places[label]] = flat_numbers(annotation.keypoints, where)
     return schema, list(rows.items())
-
-
-def _some(values: Any, limit: int = 3) -> str:
-    listed = sorted(map(str, values))
-    return ", ".join(listed[:limit]) + (", ..." if len(listed) > limit else "")

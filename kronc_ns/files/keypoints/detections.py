@@ -28,7 +28,7 @@ class Detections:
     frames: Mapping[str, Float[np.ndarray, "_ j 3"]]
     """Image as the file calls it -> its M instances of (u, v, confidence); confidence 0: not seen."""
     size: tuple[int, int] | None = None
-    """(width, height) of the images, where the file says."""
+    """(width, height) of the images, where the file says one for all."""
     sigma_px: Mapping[str, Float[np.ndarray, "_ j"]] | None = None
     """Standard deviation of each place along one axis, beside `frames`, where the detector knew it; 0: not seen."""
     called: Called = "file"
@@ -37,6 +37,8 @@ class Detections:
     """(u, v) are shares of the image's width and height instead of pixels."""
     notes: tuple[str, ...] = ()
     """What reading left out."""
+    sizes: Mapping[str, tuple[int, int]] | None = None
+    """(width, height) of each image, beside `frames`, where the file says several."""
 
 
 def match_keypoints(
@@ -50,16 +52,12 @@ def match_keypoints(
 
     ``sizes`` are the (width, height) of the images where they are not all the camera's.
     """
-    if found.size is not None and found.size != (camera.width, camera.height):
-        raise KroncError(
-            f"{found.source} is for {found.size[0]}x{found.size[1]} images, the camera says "
-            f"{camera.width}x{camera.height}: expected keypoints in the pixels of the images"
-        )
-    matched = _by_image(found, names)
+    each = sizes or [(camera.width, camera.height)] * len(names)
+    keys = _keys(found, names)
+    _check_sizes(found, keys, dict(zip(names, each, strict=True)))
     empty = np.zeros((0, len(found.schema), 3))
-    instances = [matched.get(name, empty) for name in names]
+    instances = [found.frames[keys[name]] if name in keys else empty for name in names]
     if found.relative:
-        each = sizes or [(camera.width, camera.height)] * len(names)
         instances = [rows * np.array([*size, 1.0]) for rows, size in zip(instances, each, strict=True)]
     if not any((rows[..., 2] > 0).any() for rows in instances):
         raise KroncError(
@@ -67,19 +65,37 @@ def match_keypoints(
         )
     several = [i for i, rows in enumerate(instances) if len(rows) > 1]
     read = [read_grey(path) if i in several else None for i, path in enumerate(masks)] if masks and several else None
-    rows, note = select_instances(instances, (camera.width, camera.height), read)
+    rows, note = select_instances(instances, each, read)
     return rows, "; ".join([*found.notes, *([note] if several else [])])
 
 
-def _by_image(found: Detections, names: tuple[str, ...]) -> dict[str, Float[np.ndarray, "_ j 3"]]:
-    """The instances of each of these images; a `KroncError` where the file has others, too."""
+def _check_sizes(found: Detections, keys: Mapping[str, str], sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Raise `KroncError` where the file's images are not of the images' (width, height)."""
+    here = sorted(set(sizes.values()))
+    if found.size is not None and here != [found.size]:
+        what = "x".join(map(str, here[0])) if len(here) == 1 else f"{len(here)} sizes"
+        raise KroncError(
+            f"{found.source} is for {found.size[0]}x{found.size[1]} images, the camera says {what}: expected "
+            "keypoints in the pixels of the images" + ", and no width and height for all" * (len(here) > 1)
+        )
+    for name, key in keys.items():
+        size = (found.sizes or {}).get(key, sizes[name])
+        if size != sizes[name]:
+            raise KroncError(
+                f"{found.source}: {key} is {size[0]}x{size[1]}, {name} {sizes[name][0]}x{sizes[name][1]}: "
+                "expected keypoints in the pixels of the images"
+            )
+
+
+def _keys(found: Detections, names: tuple[str, ...]) -> dict[str, str]:
+    """What the file calls each of these images; a `KroncError` where it has others, too."""
     own = _names_by(found.called, names)
-    matched: dict[str, np.ndarray] = {}
+    keys: dict[str, str] = {}
     unknown = []
-    for key, instances in found.frames.items():
+    for key in found.frames:
         plain = PurePosixPath(key).name if found.called == "file" else key
         if name := key if key in names else own.get(plain, ""):
-            matched[name] = instances
+            keys[name] = key
         else:
             unknown.append(key)
     if unknown:
@@ -87,7 +103,7 @@ def _by_image(found: Detections, names: tuple[str, ...]) -> dict[str, Float[np.n
             f"{found.source} has keypoints for {len(unknown)} images that do not exist ({unknown[0]}): expected "
             + _expected(found.called, names[0])
         )
-    return matched
+    return keys
 
 
 def _expected(called: Called, name: str) -> str:

@@ -155,3 +155,15 @@ def test_numbered_points_with_names_for_them(tmp_path):
     (tmp_path / "cvat.json").write_text(json.dumps(cvat(["nose", "b", "c", "d"], POINTS)))
     with pytest.raises(KroncError, match="the point 'nose' is none of the 4 of 'names'"):
         read_keypoints(tmp_path / "cvat.json", str(names))
+
+
+def test_images_of_several_sizes(tmp_path):
+    content = cvat(["car"], [(1, [1.0, 2.0, 2] * 5)])
+    content["images"].append({"id": 2, "file_name": "b.png", "width": 80, "height": 60})
+    content["annotations"].append(content["annotations"][0] | {"id": 9, "image_id": 2})
+    found = read(tmp_path, content)
+    assert found.size is None
+    rows, _ = match_keypoints(found, ("images/b.png", "images/a.png"), CAMERA, sizes=[(80, 60), (40, 30)])
+    np.testing.assert_allclose(rows[:, :, :2], np.broadcast_to([1.5, 2.5], (2, 5, 2)))
+    with pytest.raises(KroncError, match=r"b\.png is 80x60, images/b\.png 40x30"):
+        match_keypoints(found, ("images/b.png", "images/a.png"), CAMERA, sizes=[(40, 30), (40, 30)])
