@@ -24,6 +24,7 @@ from kronc_ns.solve.robust import INLIER_SIGMAS, noise_px
 _NO_CHANCE = 8  # a pose can be bent to meet three detections; eight do not agree by accident
 _STEPS_KEPT = 20  # of the poses on the way: enough to watch them move
 _REFINEMENTS = 3  # more rounds of undistortion with the k1 found
+_MOST_GROWTH = 3.0  # of the logarithm of a focal length: beyond, the solver flees from what does not fit
 _TOLERATED = 0.01  # of the image diagonal: what a detection may be off to count as met by half
 
 
@@ -168,7 +169,7 @@ def _refined(scene: Scene, log_growth: Float[np.ndarray, "g"], k1: Float[np.ndar
     """The scene with what was found of the intrinsics of its cameras."""
 
     def changed(camera: Camera, lens: int) -> Camera:
-        growth = math.exp(log_growth[lens])
+        growth = math.exp(max(-_MOST_GROWTH, min(_MOST_GROWTH, log_growth[lens])))
         return replace(camera, fx=camera.fx * growth, fy=camera.fy * growth, k1=camera.k1 + float(k1[lens]))
 
     if scene.lenses is None:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from kronc_ns.fit.attempts import Attempt
-from kronc_ns.fit.starts import single_views
+from kronc_ns.fit.starts import MIN_POINTS, single_views
 from kronc_ns.geometry.poses import invert
 from kronc_ns.solve.resection import Views, runner_up, unexplained
 
@@ -24,7 +24,7 @@ def lead(attempt: Attempt) -> Float[np.ndarray, "n"]:
     """
     found = attempt.found
     scene, inliers = found.scene, attempt.inlier.sum(1)
-    asked = attempt.agreeing & found.used
+    asked = found.used & (inliers >= MIN_POINTS)
     asked &= (inliers < _PLENTY) | (inliers < _PLENTY_SHARE * scene.seen.sum(1))
     ahead = np.full(len(scene), math.inf)
     if not asked.any():

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from kronc_ns.fit.accident import accidents
 from kronc_ns.fit.attempts import agrees
 from kronc_ns.fit.noise import Noise
 from kronc_ns.fit.starts import MIN_POINTS
@@ -31,10 +32,12 @@ _SURE_DEG, _SURE_SHARE = 2.0, 0.03
 """Most standard deviation of a solved view's rotation, and of its centre as a share of the distance: with more, errors
 of 5 degrees are no rarity."""
 _TYPICAL_DEG = 1.5
-"""Most root mean square of the solved views' standard deviations of rotation: errors of few views are largely one, so
-that with more a mean error of 3 degrees is no rarity."""
+"""Most root mean square of the solved views' standard deviations of rotation, for k views times sqrt(1 + 1 / k): errors
+of few views are largely one, so that with more a mean error of 3 degrees is no rarity."""
 _LEAST_LEAD = 3.0
 """Detections by which a solved view's pose is better than any other."""
+_MOST_ACCIDENTS = -4.0
+"""Decimal logarithm of the number of wrong poses that are expected to meet a solved view's detections as well."""
 _LEAST_SOLVED = 0.25
 """Share of views without which the others' poses are not believed."""
 _PARALLAX_DEG = 3.0
@@ -124,7 +127,8 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     distance = _distance(evidence)
     sure = (evidence.sigma_rot_deg <= _SURE_DEG) & (evidence.sigma_trans_m <= _SURE_SHARE * distance)
     alone = evidence.lead >= _LEAST_LEAD
-    columns = (x.tolist() for x in (found, counted, good, agree, alone, sure, rmse * scene.enlargement))
+    meant = accidents(error, _boxes(scene), evidence.noise.sigma_px) <= _MOST_ACCIDENTS
+    columns = (x.tolist() for x in (found, counted, good, agree, alone, meant, sure, rmse * scene.enlargement))
     facts = (_Facts(*row) for row in zip(*columns, strict=True))
     views = tuple(_report(name, of, evidence, i) for i, (name, of) in enumerate(zip(scene.names, facts, strict=True)))
     solved = np.array([view.status is ViewStatus.SOLVED for view in views], dtype=bool)
@@ -132,7 +136,7 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     of_solved = error[solved][~np.isnan(error[solved])]
     finite = error[np.isfinite(error)]
     median = float(np.median(finite)) if len(finite) else math.inf
-    vague = agree & alone & ~sure
+    vague = agree & alone & meant & ~sure
     status, reason = _overall(scene, evidence, solved, agree, median)
     return Verdict(
         views,
@@ -156,6 +160,8 @@ class _Facts(NamedTuple):
     agree: bool
     alone: bool
     """Whether no other pose fits nearly as well."""
+    meant: bool
+    """Whether a wrong pose would hardly meet them as well."""
     sure: bool
     """Whether the standard deviations are small enough."""
     rmse: float
@@ -172,6 +178,8 @@ def _report(name: str, of: _Facts, evidence: Evidence, i: int) -> ViewReport:
         reason = f"only {of.good} of {of.seen} keypoints agree with the other views"
     elif not of.alone:
         reason = f"its {of.seen} keypoints fit another pose nearly as well"
+    elif not of.meant:
+        reason = f"{of.good} of its {of.seen} keypoints might agree by accident"
     elif not of.sure:
         spread = "unknown" if rotation is None or centre is None else f"{rotation:.1f} deg, {centre:.2g} m"
         reason = f"the {of.good} keypoints that agree do not place it well (standard deviation {spread})"
@@ -179,6 +187,13 @@ def _report(name: str, of: _Facts, evidence: Evidence, i: int) -> ViewReport:
         return ViewReport(name, ViewStatus.FAILED, of.found, of.good, None, reason=reason)
     swapped = bool(evidence.swapped[i])
     return ViewReport(name, ViewStatus.SOLVED, of.found, of.good, of.rmse, rotation, centre, swapped=swapped)
+
+
+def _boxes(scene: Scene) -> Float[np.ndarray, "n"]:
+    """Areas of the boxes around each view's detections, in square pixels."""
+    seen = scene.seen[..., None]
+    sides = np.where(seen, scene.uv, -math.inf).max(1) - np.where(seen, scene.uv, math.inf).min(1)
+    return np.where(scene.seen.any(1), sides.prod(-1), 0.0)
 
 
 def known(value: float) -> float | None:
@@ -230,7 +245,9 @@ def _overall(
             f"only {sure} of {views} views are well determined (median standard deviation {typical:.1f} deg): "
             "take more views, or from nearer"
         )
-    elif (typical := float(np.sqrt(np.square(evidence.sigma_rot_deg[solved]).mean()))) > _TYPICAL_DEG:
+    elif (typical := float(np.sqrt(np.square(evidence.sigma_rot_deg[solved]).mean()))) * math.sqrt(
+        1 + 1 / sure
+    ) > _TYPICAL_DEG:
         problems.append(
             f"the {sure} solved of {views} views are known to {typical:.1f} deg only: take more views, or from nearer"
         )

@@ -193,3 +193,13 @@ def test_the_sigmas_know_that_only_the_template_tells(trouble):
     to_truth = umeyama(solution.points[known], CAPTURE.points[known])
     centre = to_truth.apply(solution.c2w[3, :, 3])
     assert np.linalg.norm(centre - CAPTURE.c2w[place, :, 3]) < 3 * sigma
+
+
+@pytest.mark.parametrize("seed", [162, 251])
+def test_a_focal_length_that_the_solver_lets_vanish_is_no_error(seed):
+    """Four views, few points, many of them wrong: the smallest picture of the car is the best."""
+    scene = scene_of(make_capture("carpatch", views=4, seed=seed, noise_px=0.6, missing=0.68, outliers=0.37))
+    camera = replace(scene.camera, fx=0.85 * scene.camera.fx, fy=0.85 * scene.camera.fy)
+    solution = solve_scene(replace(scene, camera=camera), KroncConfig(refine_focal=True))
+    assert solution.status is not Status.CONVERGED
+    assert solution.camera.fx > 1

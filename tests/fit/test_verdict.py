@@ -161,6 +161,32 @@ def test_a_view_that_fits_another_pose_as_well_is_not_solved(scene, evidence):
     assert verdict.solved.sum() == VIEWS - 1
 
 
+def test_a_view_that_may_agree_by_accident_is_not_solved(scene, evidence):
+    keypoints = scene.keypoints.copy()
+    seen = np.flatnonzero(scene.seen[3])
+    keypoints[3, seen[9:], 2] = 0
+    uv = reproject(evidence.points[seen[:9]], evidence.c2w[3:4], scene.camera)[0]
+    rng = np.random.default_rng(0)
+    keypoints[3, seen[:9], :2] = uv + rng.normal(size=uv.shape)
+    assert judge(replace(scene, keypoints=keypoints), evidence).solved.all()
+    keypoints[3, seen[5:9], :2] += rng.choice([-1, 1], (4, 2)) * rng.uniform(20, 40, (4, 2))
+    verdict = judge(replace(scene, keypoints=keypoints), evidence)
+    assert verdict.views[3].status is ViewStatus.FAILED
+    assert verdict.views[3].reason == "5 of its 9 keypoints might agree by accident"
+    assert not verdict.vague.any(), "it may stand elsewhere"
+    assert verdict.solved.sum() == VIEWS - 1
+
+
+@pytest.mark.parametrize(("views", "status"), [(3, Status.WEAK), (20, Status.CONVERGED)])
+def test_few_views_must_be_known_better(evidence, scene, views, status):
+    every = slice(None, None, VIEWS // views)
+    chosen = replace(scene, names=scene.names[every][:views], keypoints=scene.keypoints[every][:views])
+    known = {name: getattr(evidence, name)[every][:views] for name in ("c2w", "sigma_trans_m", "swapped", "lead")}
+    alone = TwoCars(0.0, np.zeros(views, dtype=bool))
+    few = replace(evidence, **known, sigma_rot_deg=np.full(views, 1.4), two_cars=alone)
+    assert judge(chosen, few).status is status
+
+
 def blurred(scene: Scene, noise_px: float) -> Scene:
     noise = noise_px * np.random.default_rng(0).normal(size=scene.uv.shape)
     keypoints = scene.keypoints.copy()
