@@ -54,12 +54,8 @@ def refine_scene(
         reason = f"{len(views)} views have a pose: expected {_LEAST_VIEWS} or more of a solution that has not failed"
         return replace(solution, images=replace(untouched, reason=reason))
     scene = replace(scene, camera=solution.camera, lenses=solution.lenses)
-    frame, has_ground = _frame(scene, solution)
-    lenses, of_view = _lenses(scene)
-    start = Rig.of(solution.c2w[views], lenses, of_view[views], solution.points).moved(frame)
     counter = Counter(progress)
-    keypoints = keypoint_tracks(scene, solution, views)
-    prepared = prepare(scene, views, start, keypoints, has_ground, pictures, config, counter)
+    prepared, frame = prepare_scene(scene, solution, pictures, config, counter)
     region = "vehicle" if prepared.vehicle_only else "frame"
     said = replace(untouched, region=region, background_still=prepared.background_still)
     found = find_poses(prepared, config, counter)
@@ -86,6 +82,21 @@ def refine_scene(
     if evidence.objection:
         return replace(solution, images=replace(said, seconds=time.perf_counter() - begin))
     return _taken(scene, solution, found, prepared, frame, said, config, begin)
+
+
+def prepare_scene(
+    scene: Scene, solution: Solution, pictures: Pictures, config: RefineConfig, counter: Counter
+) -> tuple[Prepared, Similarity]:
+    """The views that have a pose, and their features; and what carries the solution's world to that of the features.
+
+    The scene's cameras are those of the solution.
+    """
+    views = np.flatnonzero(solution.posed)
+    frame, has_ground = _frame(scene, solution)
+    lenses, of_view = _lenses(scene)
+    start = Rig.of(solution.c2w[views], lenses, of_view[views], solution.points).moved(frame)
+    keypoints = keypoint_tracks(scene, solution, views)
+    return prepare(scene, views, start, keypoints, has_ground, pictures, config, counter), frame
 
 
 def _with_newcomers(

@@ -2,8 +2,8 @@
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,11 +22,13 @@ from kronc_ns.files.keypoints import match_keypoints, sigma_of
 from kronc_ns.files.photos import photos
 from kronc_ns.fit.options import KroncConfig
 from kronc_ns.fit.pipeline import solve_scene
-from kronc_ns.geometry.alignment import pose_errors
+from kronc_ns.geometry.alignment import pose_errors, umeyama
 from kronc_ns.geometry.poses import posed
+from kronc_ns.refine.counter import Counter
 from kronc_ns.refine.options import RefineConfig, Region
 from kronc_ns.refine.pictures import Pictures
-from kronc_ns.refine.pipeline import refine_scene
+from kronc_ns.refine.pipeline import prepare_scene, refine_scene
+from kronc_ns.refine.rounds import find_poses
 from kronc_ns.solution import Solution, Status
 
 _HARM_SCENES, _DETECTED = 200, 0.4  # and the share of them with points of the builtin detector
@@ -40,6 +42,7 @@ _SHOWN = (
     "rotations_within",
     "centres_within",
 )
+_PLAIN = Trouble()
 _TAKEN = Limit("taken", at_least=1.0)
 
 
@@ -68,6 +71,7 @@ def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[
                 {"mean": _SHOWN},
             )
         )
+        rows.append(_from_truth_row("hemisphere", partial(_from_truth, spheres), len(spheres)))
     spin = photo_folder / "spin_suv" if photo_folder else None
     if spin is not None and spin.is_dir():
         rows.append(
@@ -76,7 +80,7 @@ def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[
                 "spin_suv, 36 views, measured keypoints; its reference is good to about 0.3 deg and 6 cm and was made "
                 "from the same keypoints; gain: share by which the held-out tracks' median residual falls",
                 1,
-                partial(_measure, [spin], noise_px=0.0),
+                partial(_measure, [spin], draw=_Draw(noise_px=0.0)),
                 (
                     Limit("rotation_deg", at_most=0.25),
                     Limit("centre_cm", at_most=3.5),
@@ -91,6 +95,11 @@ def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[
     return rows, missing
 
 
+def _from_truth_row(name: str, measure: Callable[[int], Figures], seeds: int) -> Row:
+    text = "what the features of these photos allow: matched and adjusted from the true poses"
+    return Row(f"{name}, from the truth", text, seeds, measure, (), {"mean": ("rotation_deg", "centre_cm")})
+
+
 def _walk_rows(walks: Sequence[Path]) -> list[Row]:
     rows = []
     count = len(walks)
@@ -100,19 +109,20 @@ def _walk_rows(walks: Sequence[Path]) -> list[Row]:
                 f"walk, {100 * share:.0f} % of the photos",
                 f"{count} cars, 60 views in a car park, keypoints of 1 px; intervals of {INTERVAL} sigma",
                 count,
-                partial(_measure, walks, share=share),
+                partial(_measure, walks, draw=_Draw(share)),
                 (Limit("rotation_deg", at_most=deg), Limit("centre_cm", at_most=centimetres), _TAKEN),
                 {"mean": _SHOWN},
             )
         )
-    quarter = {"share": 0.25}
+    white = Trouble(white=True)
+    quarter, poor = _Draw(0.25), _Draw(0.25, noise_px=2.0, outliers=0.1)
     return [
         *rows,
         Row(
             "walk, 25 %, poor keypoints",
             "2 px, 10 % of them anywhere on the car's box",
             count,
-            partial(_measure, walks, noise_px=2.0, outliers=0.1, **quarter),
+            partial(_measure, walks, draw=poor),
             (Limit("rotation_deg", at_most=0.03), _TAKEN),
             {"mean": _SHOWN},
         ),
@@ -120,7 +130,7 @@ def _walk_rows(walks: Sequence[Path]) -> list[Row]:
             "walk, 25 %, builtin detector",
             "the points that the detector finds in the photos",
             count,
-            partial(_measure, walks, detect=True, **quarter),
+            partial(_measure, walks, draw=_Draw(0.25, detect=True)),
             (Limit("rotation_deg", at_most=0.03), _TAKEN),
             {"mean": _SHOWN},
         ),
@@ -128,7 +138,7 @@ def _walk_rows(walks: Sequence[Path]) -> list[Row]:
             "walk, bare photos",
             "all photos and nothing else: the points that the detector finds, the focal length 20 % wrong and refined",
             count,
-            partial(_measure, walks, detect=True, focal=1.2),
+            partial(_measure, walks, draw=_Draw(detect=True), focal=1.2),
             (
                 Limit("rotation_deg", at_most=0.015),
                 Limit("centre_cm", at_most=0.2),
@@ -141,7 +151,7 @@ def _walk_rows(walks: Sequence[Path]) -> list[Row]:
             "vehicle alone",
             "white around it",
             count,
-            partial(_measure, walks, trouble=Trouble(white=True)),
+            partial(_measure, walks, trouble=white),
             (Limit("rotation_deg", at_most=0.10), _TAKEN),
             {"mean": _SHOWN},
         ),
@@ -149,15 +159,23 @@ def _walk_rows(walks: Sequence[Path]) -> list[Row]:
             "vehicle alone, 25 %",
             "white around it",
             count,
-            partial(_measure, walks, trouble=Trouble(white=True), **quarter),
+            partial(_measure, walks, draw=quarter, trouble=white),
             (Limit("rotation_deg", at_most=0.25), _TAKEN),
             {"mean": _SHOWN},
+        ),
+        *(
+            _from_truth_row(name, partial(_from_truth, walks, draw=draw, trouble=trouble), count)
+            for name, draw, trouble in (
+                ("walk, 25 %, poor keypoints", poor, _PLAIN),
+                ("vehicle alone", _Draw(), white),
+                ("vehicle alone, 25 %", quarter, white),
+            )
         ),
         Row(
             "focal length unknown",
             "50 % of the photos, the focal length 20 % wrong and refined",
             count,
-            partial(_measure, walks, share=0.5, focal=1.2),
+            partial(_measure, walks, draw=_Draw(0.5), focal=1.2),
             (Limit("focal_percent", "worst", at_most=0.2), _TAKEN),
             {"mean": _SHOWN},
         ),
@@ -183,25 +201,47 @@ def _walk_rows(walks: Sequence[Path]) -> list[Row]:
     ]
 
 
+@dataclass(frozen=True)
+class _Draw:
+    """What is left of a capture, and what is known of it."""
+
+    share: float = 1.0
+    """Of the photos."""
+    noise_px: float = 1.0
+    outliers: float = 0.0
+    detect: bool = False
+    """Points of the builtin detector."""
+
+    def of(self, folder: Path, seed: int) -> Subject:
+        subject = from_folder(folder)
+        rng = np.random.default_rng([seed, 7])
+        subject = thinned(subject, max(3, round(len(subject.truth) * self.share)))
+        if self.detect:
+            return _detected(subject)
+        return with_outliers(with_noise(subject, self.noise_px, rng), self.outliers, rng) if self.noise_px else subject
+
+
 def _measure(
-    folders: Sequence[Path],
-    seed: int,
-    share: float = 1.0,
-    noise_px: float = 1.0,
-    outliers: float = 0.0,
-    detect: bool = False,
-    focal: float = 1.0,
-    trouble: Trouble | None = None,
+    folders: Sequence[Path], seed: int, draw: _Draw = _Draw(), focal: float = 1.0, trouble: Trouble = _PLAIN
 ) -> Figures:
     """One capture: solved from its keypoints, then refined."""
-    subject = from_folder(folders[seed % len(folders)])
-    rng = np.random.default_rng([seed, 7])
-    subject = thinned(subject, max(3, round(len(subject.truth) * share)))
-    if detect:
-        subject = _detected(subject)
-    elif noise_px:
-        subject = with_outliers(with_noise(subject, noise_px, rng), outliers, rng)
-    return _refined(subject, focal, trouble or Trouble(), "auto")[0]
+    return _refined(draw.of(folders[seed % len(folders)], seed), focal, trouble, "auto")[0]
+
+
+def _from_truth(folders: Sequence[Path], seed: int, draw: _Draw = _Draw(), trouble: Trouble = _PLAIN) -> Figures:
+    """What the photos' features allow: the same capture, matched and adjusted from the true poses."""
+    subject = draw.of(folders[seed % len(folders)], seed)
+    solution = solve_scene(subject.scene)
+    right = subject.scene.with_sides_swapped(solution.swapped)
+    placed = posed(solution.c2w)
+    onto = umeyama(subject.truth[placed][..., 3], solution.c2w[placed][..., 3])
+    true = replace(solution, c2w=np.where(placed[:, None, None], onto.apply_to_poses(subject.truth), math.nan))
+    config, counter = RefineConfig(), Counter(None)
+    prepared, _ = prepare_scene(right, true, _pictures(subject, trouble), config, counter)
+    found = find_poses(prepared, config, counter)
+    if found is None:
+        raise KroncError("the photos have too few features in common")
+    return pose_figures(found.adjusted.rig.c2w, subject.truth[placed])
 
 
 def _refined(subject: Subject, focal: float, trouble: Trouble, region: Region) -> tuple[Figures, Solution]:
