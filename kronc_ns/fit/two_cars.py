@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from kronc_ns.fit.attempts import Attempt
 from kronc_ns.geometry.poses import unit
@@ -121,12 +120,11 @@ def _split(
     information = (
         own.reshape(size, size) - shared @ shared.T + attempt.noise.sigma_px**2 * _prior(attempt.problem, points)
     )
-    factor = cho_factor(information, lower=True)
-    whitened = solve_triangular(factor[0], gradient.T, lower=True)
-    side = np.where(np.linalg.eigh(whitened.T @ whitened)[1][:, -1] < 0, -1.0, 1.0)
+    whitened = np.linalg.solve(np.linalg.cholesky(information), gradient.T)
+    likeness = whitened.T @ whitened
+    side = np.where(np.linalg.eigh(likeness)[1][:, -1] < 0, -1.0, 1.0)
     for _ in range(_ROUNDS):
-        apart = cho_solve(factor, gradient.T @ side)
-        better = np.where(gradient @ apart < 0, -1.0, 1.0)
+        better = np.where(likeness @ side < 0, -1.0, 1.0)
         if (better == side).all():
             break
         side = better
