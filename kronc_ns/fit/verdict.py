@@ -23,17 +23,17 @@ POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
 _NOISY = 0.006
 """Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
-_TWO_CARS = 0.4
-"""Share of the squared residuals that two shapes explain, from which on they are two: the habits of a detector come to
-0.25, two cars mostly to 0.4 to 0.8."""
+_TWO_CARS = 0.35
+"""Share of the squared residuals that two shapes explain, from which on they are two: noise comes to 0.29 at most, the
+habits of a detector to 0.25, two cars mostly to 0.4 to 0.8."""
 _LEAST_FREEDOM = 10
 """Measurements beyond the unknowns without which a fit tells nothing of its noise."""
 _SURE_DEG, _SURE_SHARE = 2.0, 0.03
 """Most standard deviation of a solved view's rotation, and of its centre as a share of the distance: with more, errors
 of 5 degrees are no rarity."""
-_TYPICAL_DEG = 1.5
-"""Most root mean square of the solved views' standard deviations of rotation, for k views times sqrt(1 + 1 / k): errors
-of few views are largely one, so that with more a mean error of 3 degrees is no rarity."""
+_TYPICAL_DEG, _TYPICAL_SHARE = 1.55, 0.028
+"""Most root mean square of these of k solved views, times sqrt(1 + 1 / k): errors of few views are largely one, so that
+with more a mean error of 3 degrees is no rarity."""
 _LEAST_LEAD = 3.0
 """Detections by which a solved view's pose is better than any other."""
 _MOST_ACCIDENTS = -4.0
@@ -245,11 +245,9 @@ def _overall(
             f"only {sure} of {views} views are well determined (median standard deviation {typical:.1f} deg): "
             "take more views, or from nearer"
         )
-    elif (typical := float(np.sqrt(np.square(evidence.sigma_rot_deg[solved]).mean()))) * math.sqrt(
-        1 + 1 / sure
-    ) > _TYPICAL_DEG:
+    elif typical := _vague(evidence, solved):
         problems.append(
-            f"the {sure} solved of {views} views are known to {typical:.1f} deg only: take more views, or from nearer"
+            f"the {sure} solved of {views} views are known to {typical} only: take more views, or from nearer"
         )
     if count > 1 and (_parallax_deg(evidence, agreeing) < _PARALLAX_DEG or _all_alike(scene, agreeing)):
         problems.append("all views are from the same place: take them from around the object")
@@ -258,6 +256,15 @@ def _overall(
     if problems:
         return Status.WEAK, f"{'; '.join(problems)}; {fit}"
     return Status.CONVERGED, f"{sure} of {views} views solved; {fit}"
+
+
+def _vague(evidence: Evidence, solved: Bool[np.ndarray, "n"]) -> str:
+    """How well solved views are known, if that is not enough."""
+    share = evidence.sigma_trans_m[solved] / _distance(evidence)[solved]
+    degrees, share = (float(np.sqrt(np.square(sigma).mean())) for sigma in (evidence.sigma_rot_deg[solved], share))
+    few = math.sqrt(1 + 1 / int(solved.sum()))
+    enough = few * degrees <= _TYPICAL_DEG and few * share <= _TYPICAL_SHARE
+    return "" if enough else f"{degrees:.1f} deg and {100 * share:.1f} % of the distance"
 
 
 def _distance(evidence: Evidence) -> Float[np.ndarray, "n"]:

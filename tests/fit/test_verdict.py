@@ -177,6 +177,16 @@ def test_a_view_that_may_agree_by_accident_is_not_solved(scene, evidence):
     assert verdict.solved.sum() == VIEWS - 1
 
 
+@pytest.mark.parametrize(("share", "status"), [(0.025, Status.CONVERGED), (0.029, Status.WEAK)])
+def test_centres_must_be_known_as_well(scene, evidence, share, status):
+    middle = evidence.points[np.isfinite(evidence.points).all(-1)].mean(0)
+    distance = np.linalg.norm(evidence.c2w[..., 3] - middle, axis=-1)
+    verdict = judge(scene, replace(evidence, sigma_trans_m=share * distance))
+    assert verdict.solved.all()
+    assert verdict.status is status
+    assert ("2.9 % of the distance only" in verdict.reason) == (status is Status.WEAK)
+
+
 @pytest.mark.parametrize(("views", "status"), [(3, Status.WEAK), (20, Status.CONVERGED)])
 def test_few_views_must_be_known_better(evidence, scene, views, status):
     every = slice(None, None, VIEWS // views)
@@ -227,7 +237,12 @@ def test_views_without_enough_agreement_say_so(scene, evidence):
         ({}, {"sigma_rot_deg": np.full(VIEWS, 8.0)}, Status.WEAK, "0 of 20 views are well determined"),
         ({}, {"sigma_rot_deg": np.full(VIEWS, 8.0)}, Status.WEAK, "8.0 deg): take more views"),
         ({}, {"sigma_rot_deg": np.full(VIEWS, math.nan)}, Status.WEAK, "well determined"),
-        ({}, {"sigma_rot_deg": np.full(VIEWS, 1.7)}, Status.WEAK, "known to 1.7 deg only: take more views"),
+        (
+            {},
+            {"sigma_rot_deg": np.full(VIEWS, 1.7)},
+            Status.WEAK,
+            "known to 1.7 deg and 0.4 % of the distance only: take more views",
+        ),
         ({}, {"sigma_rot_deg": np.array([0.3] * 12 + [1.9] * 8)}, Status.CONVERGED, "20 of 20 views solved"),
         ({}, {"converged": False}, Status.WEAK, "still moving after 12 steps"),
         ({}, {"noise": Noise(3.5, 1.0, 500)}, Status.WEAK, "fit poorly (noise 3.5 px)"),
