@@ -22,7 +22,7 @@ _EXACT = 0.0005
 """Share of the image diagonal: residuals up to this are none of a detector's."""
 _FREEDOM = 3
 """Degrees of freedom for each point without which two shapes explain too much by chance."""
-_ALIKE = 3.0
+_ALIKE = 2.0
 """Times what noise would do, by which neighbouring views are off alike, or to opposite sides: less is no other car."""
 _SAMPLED = 12  # views that are compared with the nearest one
 _ROUNDS = 20  # few are needed

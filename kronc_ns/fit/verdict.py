@@ -21,19 +21,20 @@ from kronc_ns.solve.robust import INLIER_SIGMAS, noise_px
 MIN_VIEWS = 3
 POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
-_NOISY = 0.006
+_NOISY = 0.0065
 """Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
 _TWO_CARS = 0.35
 """Share of the squared residuals that two shapes explain, from which on they are two: noise comes to 0.29 at most, the
 habits of a detector to 0.25, two cars mostly to 0.4 to 0.8."""
-_LEAST_FREEDOM = 10
-"""Measurements beyond the unknowns without which a fit tells nothing of its noise."""
+_LEAST_FREEDOM, _LEAST_OF_VIEW = 40, 2.0
+"""Measurements beyond the unknowns without which a fit tells little of its noise; and of a solved view, of whose points
+each takes three, shared by those that see it: fewer, and points are bent to where a wrong pose sees them."""
 _SURE_DEG, _SURE_SHARE = 2.0, 0.03
 """Most standard deviation of a solved view's rotation, and of its centre as a share of the distance: with more, errors
 of 5 degrees are no rarity."""
-_TYPICAL_DEG, _TYPICAL_SHARE = 1.55, 0.028
-"""Most root mean square of these of k solved views, times sqrt(1 + 1 / k): errors of few views are largely one, so that
-with more a mean error of 3 degrees is no rarity."""
+_FEW_DEG, _FEW_SHARE = 4.0, 2.0
+"""Of k solved views the root mean squares of these, times sqrt(1 + 4 / k) and sqrt(1 + 2 / k), may be no more, either:
+errors of few views are largely one, so that with more a mean error of 3 degrees or half a metre is no rarity."""
 _LEAST_LEAD = 3.0
 """Detections by which a solved view's pose is better than any other."""
 _MOST_ACCIDENTS = -4.0
@@ -128,7 +129,10 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     sure = (evidence.sigma_rot_deg <= _SURE_DEG) & (evidence.sigma_trans_m <= _SURE_SHARE * distance)
     alone = evidence.lead >= _LEAST_LEAD
     meant = accidents(error, _boxes(scene), evidence.noise.sigma_px) <= _MOST_ACCIDENTS
-    columns = (x.tolist() for x in (found, counted, good, agree, alone, meant, sure, rmse * scene.enlargement))
+    held = int(agree.sum()) < MIN_VIEWS  # by the template alone, and never called converged
+    checked = held | (_freedom_of_views(inlier) >= _LEAST_OF_VIEW)
+    told = (found, counted, good, agree, alone, meant, checked, sure, rmse * scene.enlargement)
+    columns = (x.tolist() for x in told)
     facts = (_Facts(*row) for row in zip(*columns, strict=True))
     views = tuple(_report(name, of, evidence, i) for i, (name, of) in enumerate(zip(scene.names, facts, strict=True)))
     solved = np.array([view.status is ViewStatus.SOLVED for view in views], dtype=bool)
@@ -136,7 +140,7 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     of_solved = error[solved][~np.isnan(error[solved])]
     finite = error[np.isfinite(error)]
     median = float(np.median(finite)) if len(finite) else math.inf
-    vague = agree & alone & meant & ~sure
+    vague = agree & alone & meant & checked & ~sure
     status, reason = _overall(scene, evidence, solved, agree, median)
     return Verdict(
         views,
@@ -162,6 +166,8 @@ class _Facts(NamedTuple):
     """Whether no other pose fits nearly as well."""
     meant: bool
     """Whether a wrong pose would hardly meet them as well."""
+    checked: bool
+    """Whether enough of its points are known from other views."""
     sure: bool
     """Whether the standard deviations are small enough."""
     rmse: float
@@ -180,6 +186,8 @@ def _report(name: str, of: _Facts, evidence: Evidence, i: int) -> ViewReport:
         reason = f"its {of.seen} keypoints fit another pose nearly as well"
     elif not of.meant:
         reason = f"{of.good} of its {of.seen} keypoints might agree by accident"
+    elif not of.checked:
+        reason = f"the {of.good} keypoints that agree are seen by too few other views to check its pose"
     elif not of.sure:
         spread = "unknown" if rotation is None or centre is None else f"{rotation:.1f} deg, {centre:.2g} m"
         reason = f"the {of.good} keypoints that agree do not place it well (standard deviation {spread})"
@@ -187,6 +195,12 @@ def _report(name: str, of: _Facts, evidence: Evidence, i: int) -> ViewReport:
         return ViewReport(name, ViewStatus.FAILED, of.found, of.good, None, reason=reason)
     swapped = bool(evidence.swapped[i])
     return ViewReport(name, ViewStatus.SOLVED, of.found, of.good, of.rmse, rotation, centre, swapped=swapped)
+
+
+def _freedom_of_views(inlier: Bool[np.ndarray, "n j"]) -> Float[np.ndarray, "n"]:
+    """Measurements of each view less its unknowns, and less its share of the unknowns of its points."""
+    support = np.maximum(inlier.sum(0), 2)  # what a single view sees is held by the template at most
+    return np.where(inlier, 2 - 3 / support, 0.0).sum(1) - 6
 
 
 def _boxes(scene: Scene) -> Float[np.ndarray, "n"]:
@@ -262,8 +276,8 @@ def _vague(evidence: Evidence, solved: Bool[np.ndarray, "n"]) -> str:
     """How well solved views are known, if that is not enough."""
     share = evidence.sigma_trans_m[solved] / _distance(evidence)[solved]
     degrees, share = (float(np.sqrt(np.square(sigma).mean())) for sigma in (evidence.sigma_rot_deg[solved], share))
-    few = math.sqrt(1 + 1 / int(solved.sum()))
-    enough = few * degrees <= _TYPICAL_DEG and few * share <= _TYPICAL_SHARE
+    alike_deg, alike_share = (math.sqrt(1 + few / int(solved.sum())) for few in (_FEW_DEG, _FEW_SHARE))
+    enough = alike_deg * degrees <= _SURE_DEG and alike_share * share <= _SURE_SHARE
     return "" if enough else f"{degrees:.1f} deg and {100 * share:.1f} % of the distance"
 
 
