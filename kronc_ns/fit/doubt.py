@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from kronc_ns.fit.attempts import Attempt
 from kronc_ns.fit.starts import MIN_POINTS, single_views
@@ -17,6 +17,11 @@ _APART_DEG = 10.0
 """A pose that is turned less is the same."""
 
 
+def plenty(inliers: Int[np.ndarray, "n"], seen: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Views of which so many detections agree that no other pose need be thought of."""
+    return (inliers >= _PLENTY) & (inliers >= _PLENTY_SHARE * seen)
+
+
 def lead(attempt: Attempt) -> Float[np.ndarray, "n"]:
     """How many more of its detections a view's pose meets than the best other one does, left and right exchanged too.
 
@@ -24,8 +29,7 @@ def lead(attempt: Attempt) -> Float[np.ndarray, "n"]:
     """
     found = attempt.found
     scene, inliers = found.scene, attempt.inlier.sum(1)
-    asked = found.used & (inliers >= MIN_POINTS)
-    asked &= (inliers < _PLENTY) | (inliers < _PLENTY_SHARE * scene.seen.sum(1))
+    asked = found.used & (inliers >= MIN_POINTS) & ~plenty(inliers, scene.seen.sum(1))
     ahead = np.full(len(scene), math.inf)
     if not asked.any():
         return ahead

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from kronc_ns.fit.accident import accidents
 from kronc_ns.fit.attempts import agrees
+from kronc_ns.fit.doubt import plenty
 from kronc_ns.fit.noise import Noise
 from kronc_ns.fit.starts import MIN_POINTS
 from kronc_ns.fit.two_cars import TwoCars
@@ -23,7 +24,7 @@ POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
 _NOISY = 0.0065
 """Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
-_TWO_CARS = 0.35
+_TWO_CARS = 0.31
 """Share of the squared residuals that two shapes explain, from which on they are two: noise comes to 0.29 at most, the
 habits of a detector to 0.25, two cars mostly to 0.4 to 0.8."""
 _LEAST_FREEDOM, _LEAST_OF_VIEW = 40, 2.0
@@ -128,7 +129,9 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     distance = _distance(evidence)
     sure = (evidence.sigma_rot_deg <= _SURE_DEG) & (evidence.sigma_trans_m <= _SURE_SHARE * distance)
     alone = evidence.lead >= _LEAST_LEAD
-    meant = accidents(error, _boxes(scene), evidence.noise.sigma_px) <= _MOST_ACCIDENTS
+    meant = plenty(good, found)
+    if (few := ~meant).any():
+        meant[few] = accidents(error[few], _boxes(scene, few), evidence.noise.sigma_px) <= _MOST_ACCIDENTS
     held = int(agree.sum()) < MIN_VIEWS  # by the template alone, and never called converged
     checked = held | (_freedom_of_views(inlier) >= _LEAST_OF_VIEW)
     told = (found, counted, good, agree, alone, meant, checked, sure, rmse * scene.enlargement)
@@ -203,11 +206,11 @@ def _freedom_of_views(inlier: Bool[np.ndarray, "n j"]) -> Float[np.ndarray, "n"]
     return np.where(inlier, 2 - 3 / support, 0.0).sum(1) - 6
 
 
-def _boxes(scene: Scene) -> Float[np.ndarray, "n"]:
-    """Areas of the boxes around each view's detections, in square pixels."""
-    seen = scene.seen[..., None]
-    sides = np.where(seen, scene.uv, -math.inf).max(1) - np.where(seen, scene.uv, math.inf).min(1)
-    return np.where(scene.seen.any(1), sides.prod(-1), 0.0)
+def _boxes(scene: Scene, chosen: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
+    """Areas of the boxes around the detections of some views, in square pixels."""
+    seen, uv = scene.seen[chosen][..., None], scene.uv[chosen]
+    sides = np.where(seen, uv, -math.inf).max(1) - np.where(seen, uv, math.inf).min(1)
+    return np.where(seen.any((1, 2)), sides.prod(-1), 0.0)
 
 
 def known(value: float) -> float | None:
