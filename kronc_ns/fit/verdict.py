@@ -143,7 +143,7 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     of_solved = error[solved][~np.isnan(error[solved])]
     finite = error[np.isfinite(error)]
     median = float(np.median(finite)) if len(finite) else math.inf
-    vague = agree & alone & meant & checked & ~sure
+    vague = agree & alone & meant & ~(checked & sure)
     status, reason = _overall(scene, evidence, solved, agree, median)
     return Verdict(
         views,
