@@ -121,10 +121,10 @@ def _split(
         own.reshape(size, size) - shared @ shared.T + attempt.noise.sigma_px**2 * _prior(attempt.problem, points)
     )
     whitened = np.linalg.solve(np.linalg.cholesky(information), gradient.T)
-    likeness = whitened.T @ whitened
-    side = np.where(np.linalg.eigh(likeness)[1][:, -1] < 0, -1.0, 1.0)
+    gram = whitened.T @ whitened
+    side = np.where(np.linalg.eigh(gram)[1][:, -1] < 0, -1.0, 1.0)
     for _ in range(_ROUNDS):
-        better = np.where(likeness @ side < 0, -1.0, 1.0)
+        better = np.where(gram @ side < 0, -1.0, 1.0)
         if (better == side).all():
             break
         side = better

@@ -262,9 +262,9 @@ def _overall(
             f"only {sure} of {views} views are well determined (median standard deviation {typical:.1f} deg): "
             "take more views, or from nearer"
         )
-    elif typical := _vague(evidence, solved):
+    elif spread := _vague(evidence, solved):
         problems.append(
-            f"the {sure} solved of {views} views are known to {typical} only: take more views, or from nearer"
+            f"the {sure} solved of {views} views are known to {spread} only: take more views, or from nearer"
         )
     if count > 1 and (_parallax_deg(evidence, agreeing) < _PARALLAX_DEG or _all_alike(scene, agreeing)):
         problems.append("all views are from the same place: take them from around the object")

@@ -116,7 +116,7 @@ def test_coco_annotations(tmp_path):
     expected = [[1.5, 2.5, 1.0], [3.5, 4.5, 0.5], [0, 0, 0], [5.5, 6.5, 1.0]]
     np.testing.assert_allclose(read.frames["a.png"][0], expected)
     assert read.frames["b.png"].shape == (0, 4, 3)
-    assert read.size == (40, 30)
+    assert {*read.sizes.values()} == {(40, 30)}
 
 
 def test_coco_scores_of_a_detector_are_kept(tmp_path):

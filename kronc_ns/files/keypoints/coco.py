@@ -53,14 +53,7 @@ def read_coco(path: Path, content: dict[str, Any], names: KeypointSchema | None)
     confident = from_flags(rows for _, rows in instances)
     for (image, _), rows in zip(instances, confident, strict=True):
         frames[image].append(from_pixel_indices(rows))
-    of_all = {*sizes.values()}
-    return Detections(
-        path,
-        schema,
-        {name: stacked(rows, schema) for name, rows in frames.items()},
-        size=of_all.pop() if len(of_all) == 1 else None,
-        sizes=sizes or None,
-    )
+    return Detections(path, schema, {name: stacked(rows, schema) for name, rows in frames.items()}, sizes=sizes or None)
 
 
 def _used(categories: Mapping[Any, dict], annotations: Sequence[_Annotation]) -> list[dict]:

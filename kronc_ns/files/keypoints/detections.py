@@ -38,7 +38,7 @@ class Detections:
     notes: tuple[str, ...] = ()
     """What reading left out."""
     sizes: Mapping[str, tuple[int, int]] | None = None
-    """(width, height) of each image, beside `frames`, where the file says several."""
+    """(width, height) of each image, beside `frames`, where the file says it of each."""
 
 
 def match_keypoints(

@@ -116,7 +116,7 @@ def test_a_category_for_each_point(tmp_path):
     found = read(tmp_path, cvat(["nose", "tail", "roof", "door", "never used"], POINTS))
     assert found.schema.keypoints == ("nose", "tail", "roof", "door")
     np.testing.assert_allclose(found.frames["a.png"], [[[1.5, 2.5, 1], [3.5, 4.5, 1], [5.5, 6.5, 1], [9.5, 9.5, 0.5]]])
-    assert found.size == (40, 30)
+    assert found.sizes == {"a.png": (40, 30)}
 
 
 def test_labels_that_no_annotation_uses_do_not_matter(tmp_path):
@@ -162,8 +162,9 @@ def test_images_of_several_sizes(tmp_path):
     content["images"].append({"id": 2, "file_name": "b.png", "width": 80, "height": 60})
     content["annotations"].append(content["annotations"][0] | {"id": 9, "image_id": 2})
     found = read(tmp_path, content)
-    assert found.size is None
     rows, _ = match_keypoints(found, ("images/b.png", "images/a.png"), CAMERA, sizes=[(80, 60), (40, 30)])
     np.testing.assert_allclose(rows[:, :, :2], np.broadcast_to([1.5, 2.5], (2, 5, 2)))
+    partly = read(tmp_path, cvat(["car"], [(1, [1.0, 2.0, 2] * 5)]))
+    match_keypoints(partly, ("b.png", "a.png"), CAMERA, sizes=[(80, 60), (40, 30)])  # of the other it says nothing
     with pytest.raises(KroncError, match=r"b\.png is 80x60, images/b\.png 40x30"):
         match_keypoints(found, ("images/b.png", "images/a.png"), CAMERA, sizes=[(40, 30), (40, 30)])
