@@ -39,8 +39,9 @@ def lead(attempt: Attempt) -> Float[np.ndarray, "n"]:
     views, mirrored = (
         single_views(of, points, asked, attempt.noise.sigma_px) for of in (scene, scene.with_sides_swapped(asked))
     )
-    by_itself = attempt.inlier & (supported == 1)  # points that lie where this view sees them, wherever it stands
-    views = replace(views, weight=np.where(by_itself[asked], 0.0, views.weight))
+    # points that one other view sees at most lie where this view sees them, wherever it stands
+    own = attempt.inlier & (supported <= 2)
+    views = replace(views, weight=np.where(own[asked], 0.0, views.weight))
     w2c = invert(found.c2w[asked])
     others = np.maximum(
         _met(views, runner_up(views, w2c, _APART_DEG)),

@@ -50,10 +50,14 @@ class Hypothesis:
     """Views whose detections had left and right confused."""
 
     @cached_property
+    def off_px(self) -> Float[np.ndarray, "n j 2"]:
+        """Every point's projection less its detection; inf behind a camera, NaN where either has no place."""
+        return reproject(self.points, self.c2w, self.scene.camera) - self.scene.uv
+
+    @cached_property
     def error_px(self) -> Float[np.ndarray, "n j"]:
         """Distance of every detection from its point; inf behind a camera and where either has no place."""
-        off = reproject(self.points, self.c2w, self.scene.camera) - self.scene.uv
-        error = np.hypot(off[..., 0], off[..., 1])
+        error = np.hypot(self.off_px[..., 0], self.off_px[..., 1])
         return np.where(np.isnan(error), np.inf, error)
 
     @cached_property

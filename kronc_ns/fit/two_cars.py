@@ -87,16 +87,18 @@ def _seen(attempt: Attempt, views: Int[np.ndarray, "m"], points: Int[np.ndarray,
 
 def _likeness(attempt: Attempt, views: Int[np.ndarray, "m"], points: Int[np.ndarray, "k"]) -> float:
     """How much more the residuals of some views and of their nearest views are alike, up to the sign, than noise is."""
-    state = attempt.state
-    centre = state.points[points].mean(0)
-    towards = unit(-(state.translation[views, None] @ state.rotation[views])[:, 0] - centre)
+    found, weight = attempt.found, attempt.problem.weight
+    towards = unit(found.c2w[views][..., 3] - found.points[points].mean(0))
     some = np.linspace(0, len(views) - 1, min(len(views), _SAMPLED)).astype(int)
     closeness = towards[some] @ towards.T
     closeness[np.arange(len(some)), some] = -math.inf
     nearest = closeness.argmax(1)
-    one, other = (_seen(attempt, views[of], points) for of in (some, nearest))
-    both = (one.root > 0) & (other.root > 0)
-    here, there = (np.where(both[..., None], of.residual, 0.0).reshape(len(some), -1) for of in (one, other))
+    one, other = (np.ix_(views[of], points) for of in (some, nearest))
+    both = attempt.inlier[one] & attempt.inlier[other]
+    here, there = (
+        (np.where(both[..., None], found.off_px[of], 0.0) * np.sqrt(weight[of])[..., None]).reshape(len(some), -1)
+        for of in (one, other)
+    )
     squares = np.square(here).sum(1) * np.square(there).sum(1)
     alike = np.square((here * there).sum(1)) / np.maximum(squares, np.finfo(float).tiny)
     return float((alike * 2 * both.sum(1)).mean())

@@ -17,8 +17,9 @@ from kronc_ns.solve.threads import side_by_side
 
 MOST_PX = 1280
 """Larger photos are made smaller: their finest detail is noise."""
-_SIFT_PX = 640
-"""SIFT doubles photos before it looks; where features are exactly is found later, in the larger pictures."""
+_SIFT_PX, _SIFT_PX_OF_MANY, _MANY = 640, 480, 30
+"""SIFT doubles photos before it looks; where features are exactly is found later, in the larger pictures. From so many
+photos on there are features enough, and the finest are those least sure."""
 _FEATURES, _LEAST_OF_VIEW, _MOST_OF_VIEW = 100_000, 1_500, 4_000
 """Of all views together; of each."""
 _NEIGHBOURS, _NEIGHBOURS_DEG = 2, 35.0  # that corners are followed to
@@ -81,9 +82,12 @@ def gather(
     called after each photo.
     """
     most = min(max(_FEATURES // len(views), _LEAST_OF_VIEW), _MOST_OF_VIEW)
+    sift_px = _SIFT_PX if len(views) < _MANY else _SIFT_PX_OF_MANY
     looked = []
     with _one_thread_each():
-        for one in side_by_side(lambda i: _look(pictures(int(views[i])), cameras[i], up[i], most), range(len(views))):
+        for one in side_by_side(
+            lambda i: _look(pictures(int(views[i])), cameras[i], up[i], sift_px, most), range(len(views))
+        ):
             looked.append(one)
             advance()
     features = [one.features for one in looked]
@@ -113,8 +117,8 @@ def _one_thread_each() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _look(picture: Picture, camera: Camera, up: Float[np.ndarray, "3"], most: int) -> _Looked:
-    small, shrunk = _reduced(picture, _SIFT_PX)
+def _look(picture: Picture, camera: Camera, up: Float[np.ndarray, "3"], sift_px: int, most: int) -> _Looked:
+    small, shrunk = _reduced(picture, sift_px)
     found = find_features(small, camera.scaled(shrunk), up, most)
     found = replace(found, pixel=found.pixel / shrunk, size=found.size / shrunk)
     picture, factor = _reduced(picture, MOST_PX)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from kronc_ns.fit.car_frame import standing, template_frame
-from kronc_ns.fit.verdict import inliers
+from kronc_ns.fit.verdict import MIN_VIEWS, SURE_DEG, SURE_SHARE, inliers, too_vague
 from kronc_ns.geometry.alignment import Similarity
 from kronc_ns.geometry.camera import Camera, Lenses
 from kronc_ns.geometry.poses import camera_z, unit
@@ -27,9 +27,7 @@ from kronc_ns.refine.verdict import Evidence
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Cloud, ImageEvidence, Solution, Status, ViewReport, ViewStatus
 
-_LEAST_VIEWS = 3
 _SOLVED_BY = 20  # features of three views that make a view's pose known
-_SURE_DEG, _SURE_SHARE = 2.0, 0.03  # and its standard deviations, at the most, as in the verdict on keypoints
 
 
 def refine_scene(
@@ -50,8 +48,8 @@ def refine_scene(
     untouched = ImageEvidence(
         False, "", "frame", False, (), (0,) * len(scene), 0, None, None, 0.0, 0.0, None, focal, focal, 0.0
     )
-    if solution.status is Status.FAILED or len(views) < _LEAST_VIEWS:
-        reason = f"{len(views)} views have a pose: expected {_LEAST_VIEWS} or more of a solution that has not failed"
+    if solution.status is Status.FAILED or len(views) < MIN_VIEWS:
+        reason = f"{len(views)} views have a pose: expected {MIN_VIEWS} or more of a solution that has not failed"
         return replace(solution, images=replace(untouched, reason=reason))
     scene = replace(scene, camera=solution.camera, lenses=solution.lenses)
     counter = Counter(progress)
@@ -165,7 +163,8 @@ def _taken(
     rig = adjusted.rig.moved(back)
     sightings = long_sightings(adjusted.tracks, gathered.view, len(views))
     distance = np.linalg.norm(adjusted.rig.cameras.centre - np.nanmean(adjusted.rig.keypoints, axis=0), axis=1)
-    sure = (sigma_rot <= _SURE_DEG) & (sigma_centre <= _SURE_SHARE * distance) & (sightings >= _SOLVED_BY)
+    share = sigma_centre / distance
+    sure = (sigma_rot <= SURE_DEG) & (share <= SURE_SHARE) & (sightings >= _SOLVED_BY)
     known = sure | solution.posed[views]
     c2w = np.full_like(solution.c2w, math.nan)
     c2w[views[known]] = rig.c2w[known]
@@ -189,10 +188,14 @@ def _taken(
     kept = inlier & np.array([report.status is ViewStatus.SOLVED for report in reports])[:, None]
     of_solved = error[kept.any(1)]
     solved = sum(report.status is ViewStatus.SOLVED for report in reports)
+    enough = int(sure.sum()) >= max(MIN_VIEWS, len(scene) / 2) and not too_vague(sigma_rot[sure], share[sure])
+    cured = solution.imprecise and enough
     reason = f"{solved} of {len(scene)} views solved by image features; by keypoints alone {solution.reason}"
     return replace(
         refined,
-        reason=reason if solution.status is Status.CONVERGED else solution.reason,
+        status=Status.CONVERGED if cured else solution.status,
+        reason=reason if cured or solution.status is Status.CONVERGED else solution.reason,
+        imprecise=solution.imprecise and not cured,
         views=tuple(reports),
         depths=np.where(scene.seen & kept.any(1)[:, None], camera_z(c2w, points), math.nan),
         rmse_px=float(np.sqrt(np.square(error[kept]).mean())) if kept.any() else solution.rmse_px,

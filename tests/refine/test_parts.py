@@ -131,13 +131,14 @@ def test_tracks_of_two_views_count_where_there_are_few_others():
     np.testing.assert_array_equal(np.bincount(view[kept.feature], minlength=4), [5, 5, 5 + 4, 4])
 
 
-def test_a_large_photo_has_its_features_where_they_were_photographed():
+@pytest.mark.parametrize("sift_px", [640, 480])
+def test_a_large_photo_has_its_features_where_they_were_photographed(sift_px):
     rgb = np.full((1500, 2000, 3), 90, np.uint8)
     places = np.random.default_rng(8).uniform(100, 1400, (30, 2))
     for x, y in places:
         cv2.circle(rgb, (round(16 * x) - 8, round(16 * y) - 8), 16 * 14, (230, 230, 230), -1, cv2.LINE_AA, 4)
     camera = Camera(2000.0, 2000.0, 1000.0, 750.0, 2000, 1500)
-    looked = _look(Picture(rgb, None), camera, np.array([0.0, -1.0, 0.0]), 500)
+    looked = _look(Picture(rgb, None), camera, np.array([0.0, -1.0, 0.0]), sift_px, 500)
     off = np.linalg.norm(looked.features.pixel[:, None] - places[None], axis=2).min(0)
     assert np.median(off) < 0.5
     assert looked.grey.shape == (960, 1280)

@@ -50,6 +50,19 @@ def test_what_is_said_of_it(solved, refined):
     assert all(view.sigma_rot_deg < old.sigma_rot_deg for view, old in zip(found.views, solved[1].views, strict=True))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("imprecise", [True, False])
+def test_features_cure_want_of_precision_and_no_other_doubt(walk, solved, imprecise):
+    scene, solution = solved
+    weak = replace(solution, status=Status.WEAK, imprecise=imprecise, reason="known to 2.0 deg only")
+    found = refine_scene(scene, weak, photos(walk[0], scene))
+    assert found.images.accepted
+    assert found.status is (Status.CONVERGED if imprecise else Status.WEAK)
+    assert not found.imprecise
+    assert found.reason.endswith("known to 2.0 deg only")
+    assert found.reason.startswith(f"{len(scene)} of {len(scene)} views solved by image features") is imprecise
+
+
 def test_the_world_and_its_scale_stay(solved, refined):
     known = np.isfinite(solved[1].points).all(-1)
     off = np.linalg.norm(refined[0].points[known] - solved[1].points[known], axis=-1)

@@ -15,6 +15,7 @@ from kronc_ns.benchmark.subjects import Subject, from_folder, thinned, with_nois
 from kronc_ns.benchmark.suites.degraded import Trouble, degraded, draw_trouble
 from kronc_ns.benchmark.suites.pose_measures import INTERVAL
 from kronc_ns.benchmark.suites.rows import Limit, Row
+from kronc_ns.benchmark.suites.trials import WRONG_DEG, WRONG_M
 from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.capture.detection.finding import find_keypoints
 from kronc_ns.errors import KroncError
@@ -49,11 +50,10 @@ _TAKEN = Limit("taken", at_least=1.0)
 def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[Row], list[str]]:
     """Rows of what is there, and what is missing.
 
-    ``captures`` holds rendered ones, ``walk_*`` and ``hemi_*``; ``photo_folder`` holds spin_suv.
+    ``captures`` holds rendered ones, ``walk_*``, ``hemi_*`` and ``large_*``; ``photo_folder`` holds spin_suv.
     """
-    walks = sorted(captures.glob("walk_*/")) if captures else []
-    spheres = sorted(captures.glob("hemi_*/")) if captures else []
-    walks, spheres = ([path for path in paths if path.is_dir()] for paths in (walks, spheres))
+    kinds = ("walk", "hemi", "large")
+    walks, spheres, large = ([path for path in _sorted(captures, f"{kind}_*") if path.is_dir()] for kind in kinds)
     rows: list[Row] = []
     missing = []
     if walks:
@@ -72,6 +72,19 @@ def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[
             )
         )
         rows.append(_from_truth_row("hemisphere", partial(_from_truth, spheres), len(spheres)))
+    if large:
+        rows.append(
+            Row(
+                "seconds, 100 photos",
+                "a walk, 1920x1080, keypoints of 1 px",
+                len(large),
+                partial(_warm, large),
+                (Limit("seconds", "worst", at_most=60.0), _TAKEN),
+                {"mean": _SHOWN},
+            )
+        )
+    else:
+        missing.append("no large walks: large_* in --captures, made by `kronc synth --render --views 100 --width 1920`")
     spin = photo_folder / "spin_suv" if photo_folder else None
     if spin is not None and spin.is_dir():
         rows.append(
@@ -93,6 +106,10 @@ def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[
     else:
         missing.append("no spin_suv: --photos FOLDER")
     return rows, missing
+
+
+def _sorted(folder: Path | None, pattern: str) -> list[Path]:
+    return sorted(folder.glob(pattern)) if folder else []
 
 
 def _from_truth_row(name: str, measure: Callable[[int], Figures], seeds: int) -> Row:
@@ -270,6 +287,9 @@ def _refined(subject: Subject, focal: float, trouble: Trouble, region: Region) -
         "focal_percent": 100 * abs(refined.camera.fx / true_focal - 1),
         **_intervals(refined, subject),
     }
+    cured = solution.status is Status.WEAK and refined.status is Status.CONVERGED
+    wrong = after["rotation_deg"] > WRONG_DEG or after["centre_cm"] > 100 * WRONG_M
+    figures |= {"cured": float(cured), "cured_wrong": float(cured and wrong)}
     if said.held_out_before_px and said.held_out_after_px:
         figures["gain"] = 1 - said.held_out_after_px / said.held_out_before_px
     return figures, refined
@@ -323,16 +343,21 @@ def _harm(walks: Sequence[Path], seed: int) -> Figures:
     try:
         figures, _ = _refined(subject, focal, trouble, "auto")
     except KroncError:
-        return {"harmed": 0.0, "taken": 0.0, "solved": 0.0}
+        return {"harmed": 0.0, "cured_wrong": 0.0, "taken": 0.0, "solved": 0.0}
     harmed = figures["taken"] > 0 and figures["rotation_deg"] > figures["before_deg"]
     return {**figures, "harmed": float(harmed), "solved": 1.0}
+
+
+def _warm(folders: Sequence[Path], seed: int) -> Figures:
+    """The second of two equal measurements: the first compiles."""
+    _measure(folders, seed)
+    return _measure(folders, seed)
 
 
 def _against_colmap(walks: Sequence[Path], seed: int) -> Figures:
     """Refinement and COLMAP on the same photos."""
     folder = walks[seed % len(walks)]
-    figures = dict(_measure(walks, seed))
-    figures = dict(_measure(walks, seed))  # once more: the first compiles
+    figures = _warm(walks, seed)
     subject = from_folder(folder)
     begin = time.perf_counter()
     c2w = map_images(subject.scene, folder, "incremental", masked=False)
