@@ -42,8 +42,8 @@ _LEAST_LEAD = 3.0
 _MOST_ACCIDENTS = -4.0
 """Decimal logarithm of the number of wrong poses that are expected to meet a solved view's detections as well."""
 _LEAST_SOLVED = 0.4
-"""Share of views without which the others' poses are not believed: one in 200 is off by more than 5 degrees there, eight
-times as many as elsewhere."""
+"""Share of views without which the others' poses are not believed: of those, one in 200 is off by more than 5 degrees,
+eight times as many as elsewhere."""
 _PARALLAX_DEG = 3.0
 """Views that see the points from within this angle hardly tell how far these are."""
 _ALIKE = 0.005

@@ -1,7 +1,12 @@
 """What the rows of the suite of speed measure on one seed: ratios of times that were taken in turns."""
 
 import math
+import multiprocessing
+import os
 import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from threading import Barrier
 
 import numpy as np
 from jaxtyping import Float
@@ -157,7 +162,10 @@ def _peak_megabytes(commands: Commands, seed: int, views: int) -> float:
 
 
 def throughput(seed: int, count: int) -> Figures:
-    """Many scenes on all cores over the same on one: the rates, and the largest difference of their poses."""
+    """Many scenes on all cores over the same on one: the rates, and the largest difference of their poses.
+
+    Processes that share nothing tell what of it the hardware allows.
+    """
     captures, scenes = zip(*(_posed(seed + i) for i in range(count)), strict=True)
     half = count // 2
     solve_scenes(scenes[:2], DEFAULT)
@@ -165,6 +173,7 @@ def throughput(seed: int, count: int) -> Figures:
     one_core = timed(lambda: alone.extend(_on_one_core(scenes[:half])))()
     together: list[Solution | KroncError] = []
     all_cores = timed(lambda: together.extend(solve_scenes(scenes, DEFAULT)))()
+    apart_s = _in_processes(scenes)
     one_core += timed(lambda: alone.extend(_on_one_core(scenes[half:])))()  # before and after, as the machine changes
     errors, apart = [], []
     for capture, ours, reference in zip(captures, together, alone, strict=True):
@@ -173,6 +182,7 @@ def throughput(seed: int, count: int) -> Figures:
             apart.append(float(np.abs(np.nan_to_num(ours.c2w) - np.nan_to_num(reference.c2w)).max()))
     return {
         "over_one_core": one_core / all_cores,
+        "processes_over_one_core": one_core / apart_s,
         "scenes_per_s": count / all_cores,
         "scenes_per_s_on_one_core": count / one_core,
         "apart": max(apart, default=math.inf),
@@ -181,7 +191,27 @@ def throughput(seed: int, count: int) -> Figures:
     }
 
 
-def _on_one_core(scenes: tuple[Scene, ...]) -> list[Solution | KroncError]:
+def _in_processes(scenes: Sequence[Scene]) -> float:
+    """Seconds of one process for each core, all of them warm, each with its share of the scenes."""
+    cores = os.cpu_count() or 1
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(cores, context, _meet_at, (context.Barrier(cores),)) as pool:
+        return max(pool.map(_seconds_from_the_barrier, [scenes[core::cores] for core in range(cores)]))
+
+
+def _meet_at(barrier: Barrier) -> None:
+    """Where this process waits for the others."""
+    global _barrier
+    _barrier = barrier
+
+
+def _seconds_from_the_barrier(scenes: Sequence[Scene]) -> float:
+    _on_one_core(scenes[:2])
+    _barrier.wait()
+    return timed(lambda: _on_one_core(scenes))()
+
+
+def _on_one_core(scenes: Sequence[Scene]) -> list[Solution | KroncError]:
     """One scene after the other, none of them in parts."""
     (solutions,) = side_by_side(lambda some: [solve_scenes([scene], DEFAULT)[0] for scene in some], [scenes])
     return solutions
