@@ -124,8 +124,6 @@ class Solution:
     history: Mapping[str, Sequence[float]] = field(default_factory=dict)
     path: Float[np.ndarray, "s n 3 4"] | None = None
     """Where the cameras were at steps on the way, each in a frame of its own; NaN for views that took no part."""
-    imprecise: bool = False
-    """Weak for nothing but want of precision, which image features may bring."""
     lenses: Lenses | None = None
     """The cameras of the views, where there are several."""
     images: ImageEvidence | None = None

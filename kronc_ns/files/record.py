@@ -86,7 +86,6 @@ def solution_dict(solution: Solution) -> dict[str, Any]:
         "version": kronc_ns.__version__,
         "status": solution.status.value,
         "reason": solution.reason,
-        "imprecise": solution.imprecise,
         "solver": solution.solver,
         "init": solution.init,
         "iterations": solution.iterations,
@@ -143,7 +142,6 @@ def read_solution(folder: Path) -> tuple[Scene, Solution]:
         overall: dict[str, Any] = {key: _checked(record[key], key, str) for key in ("reason", "solver", "init")}
         overall |= {"iterations": _checked(record["iterations"], "iterations", int)}
         overall |= {"seconds": _checked(record["seconds"], "seconds", int, float)}
-        overall |= {"imprecise": _checked(record.get("imprecise", False), "imprecise", bool)}
         for key in ("rmse_px", "median_px"):
             overall[key] = math.nan if record[key] is None else float(_checked(record[key], key, int, float))
         status = Status(record["status"])

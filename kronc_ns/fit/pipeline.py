@@ -296,7 +296,6 @@ def _finish(scene: Scene, attempt: Attempt, config: KroncConfig, seconds: float)
         median_px=verdict.median_px,
         history=attempt.history,
         path=attempt.path,
-        imprecise=verdict.imprecise,
         lenses=found.scene.lenses,
     )
 

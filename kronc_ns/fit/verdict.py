@@ -86,8 +86,6 @@ class Verdict:
     views: tuple[ViewReport, ...]
     status: Status
     reason: str
-    imprecise: bool
-    """Weak for nothing but want of precision."""
     rmse_px: float
     """Root mean square reprojection error over all inliers of solved views; NaN where there is none."""
     median_px: float
@@ -148,12 +146,11 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     finite = error[np.isfinite(error)]
     median = float(np.median(finite)) if len(finite) else math.inf
     vague = agree & alone & meant & ~(checked & sure)
-    status, reason, imprecise = _overall(scene, evidence, solved, agree, median)
+    status, reason = _overall(scene, evidence, solved, agree, median)
     return Verdict(
         views,
         status,
         reason,
-        imprecise,
         float(np.sqrt(np.where(kept, error**2, 0.0).sum() / max(kept.sum(), 1))),
         float(np.median(of_solved)) if len(of_solved) else math.nan,
         vague,
@@ -242,8 +239,7 @@ def _overall(
     solved: Bool[np.ndarray, "n"],
     agreeing: Bool[np.ndarray, "n"],
     median_px: float,
-) -> tuple[Status, str, bool]:
-    """The status, its reason, and whether the solution is weak for nothing but want of precision."""
+) -> tuple[Status, str]:
     share = median_px / _diagonal(scene)
     count, sure, views = int(agreeing.sum()), int(solved.sum()), len(scene)
     with_template = evidence.shape_weight is not None
@@ -251,15 +247,10 @@ def _overall(
     if not math.isfinite(median_px):
         fit = "no detection meets a solved point"
     if count == 0 or (count < MIN_VIEWS and not with_template):
-        return (
-            Status.FAILED,
-            f"{count} of {views} views agree with each other, expected at least {MIN_VIEWS}; {fit}",
-            False,
-        )
+        return Status.FAILED, f"{count} of {views} views agree with each other, expected at least {MIN_VIEWS}; {fit}"
     if share > POOR_FIT:
-        reason = f"the keypoints do not fit together: {fit}, expected below {100 * POOR_FIT:g} %"
-        return Status.FAILED, reason, False
-    problems, spread = [], ""
+        return Status.FAILED, f"the keypoints do not fit together: {fit}, expected below {100 * POOR_FIT:g} %"
+    problems = []
     if not evidence.converged:
         problems.append(f"the solver was still moving after {evidence.iterations} steps: allow more")
     if count < MIN_VIEWS:
@@ -282,25 +273,28 @@ def _overall(
     elif sure < max(MIN_VIEWS, _LEAST_SOLVED * views):
         sigma = evidence.sigma_rot_deg[agreeing]
         typical = float(np.median(sigma[np.isfinite(sigma)])) if np.isfinite(sigma).any() else math.nan
-        spread = f"only {sure} of {views} views are well determined (median standard deviation {typical:.1f} deg)"
-    elif vague := too_vague(evidence.sigma_rot_deg[solved], (evidence.sigma_trans_m / _distance(evidence))[solved]):
-        spread = f"the {sure} solved of {views} views are known to {vague} only"
+        problems.append(
+            f"only {sure} of {views} views are well determined (median standard deviation {typical:.1f} deg): "
+            "take more views, or from nearer"
+        )
+    elif spread := _vague(evidence, solved):
+        problems.append(
+            f"the {sure} solved of {views} views are known to {spread} only: take more views, or from nearer"
+        )
     if count > 1 and (_parallax_deg(evidence, agreeing) < _PARALLAX_DEG or _all_alike(scene, agreeing)):
         problems.append("all views are from the same place: take them from around the object")
     if evidence.shape_weight is not None and evidence.shape_weight < _ODD_SHAPE:
         problems.append("the points hardly look like a car: are the keypoints in the schema's order?")
-    imprecise = bool(spread) and not problems
-    if spread:
-        problems.append(f"{spread}: take more views, or from nearer")
     if problems:
-        return Status.WEAK, f"{'; '.join(problems)}; {fit}", imprecise
-    return Status.CONVERGED, f"{sure} of {views} views solved; {fit}", False
+        return Status.WEAK, f"{'; '.join(problems)}; {fit}"
+    return Status.CONVERGED, f"{sure} of {views} views solved; {fit}"
 
 
-def too_vague(sigma_deg: Float[np.ndarray, "k"], sigma_share: Float[np.ndarray, "k"]) -> str:
-    """How well k solved views are known (`sigma_share`: centres, of the distance); empty if that is enough."""
-    degrees, share = (float(np.sqrt(np.square(sigma).mean())) for sigma in (sigma_deg, sigma_share))
-    alike_deg, alike_share = (math.sqrt(1 + few / len(sigma_deg)) for few in (_FEW_DEG, _FEW_SHARE))
+def _vague(evidence: Evidence, solved: Bool[np.ndarray, "n"]) -> str:
+    """How well solved views are known, if that is not enough."""
+    share = evidence.sigma_trans_m[solved] / _distance(evidence)[solved]
+    degrees, share = (float(np.sqrt(np.square(sigma).mean())) for sigma in (evidence.sigma_rot_deg[solved], share))
+    alike_deg, alike_share = (math.sqrt(1 + few / int(solved.sum())) for few in (_FEW_DEG, _FEW_SHARE))
     enough = alike_deg * degrees <= SURE_DEG and alike_share * share <= SURE_SHARE
     return "" if enough else f"{degrees:.1f} deg and {100 * share:.1f} % of the distance"
 

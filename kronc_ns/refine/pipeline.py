@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from kronc_ns.fit.car_frame import standing, template_frame
-from kronc_ns.fit.verdict import MIN_VIEWS, SURE_DEG, SURE_SHARE, inliers, too_vague
+from kronc_ns.fit.verdict import MIN_VIEWS, SURE_DEG, SURE_SHARE, inliers
 from kronc_ns.geometry.alignment import Similarity
 from kronc_ns.geometry.camera import Camera, Lenses
 from kronc_ns.geometry.poses import camera_z, unit
@@ -163,8 +163,7 @@ def _taken(
     rig = adjusted.rig.moved(back)
     sightings = long_sightings(adjusted.tracks, gathered.view, len(views))
     distance = np.linalg.norm(adjusted.rig.cameras.centre - np.nanmean(adjusted.rig.keypoints, axis=0), axis=1)
-    share = sigma_centre / distance
-    sure = (sigma_rot <= SURE_DEG) & (share <= SURE_SHARE) & (sightings >= _SOLVED_BY)
+    sure = (sigma_rot <= SURE_DEG) & (sigma_centre <= SURE_SHARE * distance) & (sightings >= _SOLVED_BY)
     known = sure | solution.posed[views]
     c2w = np.full_like(solution.c2w, math.nan)
     c2w[views[known]] = rig.c2w[known]
@@ -188,14 +187,13 @@ def _taken(
     kept = inlier & np.array([report.status is ViewStatus.SOLVED for report in reports])[:, None]
     of_solved = error[kept.any(1)]
     solved = sum(report.status is ViewStatus.SOLVED for report in reports)
-    enough = int(sure.sum()) >= max(MIN_VIEWS, len(scene) / 2) and not too_vague(sigma_rot[sure], share[sure])
-    cured = solution.imprecise and enough
-    reason = f"{solved} of {len(scene)} views solved by image features; by keypoints alone {solution.reason}"
+    if solution.status is Status.CONVERGED:
+        reason = f"{solved} of {len(scene)} views solved by image features; by keypoints alone {solution.reason}"
+    else:  # where the car is among the cameras keypoints alone tell
+        reason = f"{solution.reason}; image features place {int(sure.sum())} views among each other all the same"
     return replace(
         refined,
-        status=Status.CONVERGED if cured else solution.status,
-        reason=reason if cured or solution.status is Status.CONVERGED else solution.reason,
-        imprecise=solution.imprecise and not cured,
+        reason=reason,
         views=tuple(reports),
         depths=np.where(scene.seen & kept.any(1)[:, None], camera_z(c2w, points), math.nan),
         rmse_px=float(np.sqrt(np.square(error[kept]).mean())) if kept.any() else solution.rmse_px,

@@ -40,7 +40,7 @@ def camera_covariance(
         lens=problem.lens,
     )
     data = records.measured(chosen)
-    now, work = records.estimate(data, state), records.system(data, *chosen.weight.shape, with_cameras=True)
+    now, work = records.estimate(data, state), records.system(data, *chosen.weight.shape)
     covariance = np.empty((len(problem.weight), 6, 6))
     schur.evaluate(data, now)
     work.weight[:] = data.own
@@ -58,7 +58,7 @@ def camera_covariance(
     edges = np.linspace(0, len(covariance), parts + 1).astype(int).tolist()
     in_parts(
         lambda part: _cameras(
-            now, work, edges[part], edges[part + 1], gauge, shared, inverse, mean, sigma_px**2, covariance
+            data, now, work, edges[part], edges[part + 1], gauge, shared, inverse, mean, sigma_px**2, covariance
         ),
         parts,
     )
@@ -67,6 +67,7 @@ def camera_covariance(
 
 @compiled
 def _cameras(
+    data: Any,
     now: Any,
     work: Any,
     begin: int,
@@ -79,8 +80,21 @@ def _cameras(
     out: Any,
 ) -> None:
     """The covariances of some cameras."""
+    size, joints = len(work.matrix), len(now.points)
+    intrinsics = int(data.with_focal) + int(data.with_k1)
+    points = 0 if data.points_known else 3 * joints
+    z = np.empty((6, size))
     for n in range(begin, end):
-        z = work.whitened[n]
+        y = schur.coupling(data, work, n)
+        first, count = data.first[n], data.first[n + 1] - data.first[n]
+        for p in range(6):
+            for i in range(size):
+                z[p, i] = 0.0
+            for c in range(3 if points else 0):
+                for k in range(count):
+                    z[p, c * joints + data.joint[first + k]] = y[p, c * count + k]
+            for s in range(intrinsics):
+                z[p, points + intrinsics * data.lens[n] + s] = y[p, len(y[p]) - intrinsics + s]
         forward(work.matrix, z)
         r, t, w = now.rotation[n], now.translation[n], work.whitener[n]
         _camera_covariance(r, t, mean, w, z, gauge, shared, inverse, variance, out[n])

@@ -75,8 +75,11 @@ class System(NamedTuple):
     """[K] scratch"""
     whitener: Array
     """[N, 6, 6]: inverse Cholesky factors of the cameras' blocks"""
-    whitened: Array
-    """[N, 6, P + 1], zeros: cameras against other unknowns, and their gradient; [0, ...] if not wanted"""
+    gradient: Array
+    """[N, 6]: the cameras' gradients, times those"""
+    coupling: Array
+    """Cameras against the other unknowns that they see, times those, view by view: six rows of its points' x, y and z
+    (none if they are known) and its lens's refined intrinsics"""
     matrix: Array
     """[P, P], lower triangle"""
     rhs: Array
@@ -124,15 +127,17 @@ def estimate(data: Measured, state: State) -> Estimate:
     )
 
 
-def system(data: Measured, views: int, joints: int, with_cameras: bool = False) -> System:
-    """Room for the system of a problem; ``with_cameras`` where the cameras' rows are wanted, too."""
-    lenses = int(data.lens.max(initial=0)) + 1
-    size = (0 if data.points_known else 3 * joints) + lenses * (data.with_focal + data.with_k1)
+def system(data: Measured, views: int, joints: int) -> System:
+    """Room for the system of a problem."""
+    lenses, refined = int(data.lens.max(initial=0)) + 1, data.with_focal + data.with_k1
+    size = (0 if data.points_known else 3 * joints) + lenses * refined
+    coupled = (0 if data.points_known else 3 * len(data.joint)) + views * refined
     return System(
         np.empty(len(data.joint)),
         np.empty(len(data.joint)),
         np.empty((views, 6, 6)),
-        np.zeros((views if with_cameras else 0, 6, size + 1)),
+        np.empty((views, 6)),
+        np.empty(6 * coupled),
         np.empty((size, size)),
         np.empty(size),
     )

@@ -95,7 +95,7 @@ def propose(
     if len(data.mean):
         belief = sigma * sigma * shape_weight(float(now.surprise[0]), data.freedom, len(data.mean))
     reduce_system(data, now, work, damping, belief, sigma * sigma)
-    if not step(data, now, trial, work, sigma * sigma):
+    if not step(data, now, trial, work):
         return math.nan
     evaluate(data, trial)
     return total_cost(data, trial, sigma, phase)
@@ -118,7 +118,7 @@ def reduce_system(data: Measured, now: Estimate, work: System, damping: float, b
     lens, camera, right = np.empty((2, 2 * most)), np.empty((6, 6)), np.empty(6)
     widest = 3 * most + shared
     columns = np.empty(widest, np.uint64)  # unsigned: else every access asks whether it counts from the end
-    mixed, y, dots = np.empty((6, widest)), np.empty((6, widest)), np.empty((2, widest))
+    mixed, dots = np.empty((6, widest)), np.empty((2, widest))
     diagonal = np.empty(size)
     with_prior = len(data.precision) > 0 and points > 0
     for i in range(size):
@@ -172,6 +172,7 @@ def reduce_system(data: Measured, now: Estimate, work: System, damping: float, b
                 matrix[i, own + d] += dot(row, lens[d], 2 * count)
             diagonal[i] += dot(row, row, 2 * count)
         width += shared
+        y = coupling(data, work, n)
         for p in range(6):
             for i in range(width):
                 y[p, i] = 0.0
@@ -183,10 +184,7 @@ def reduce_system(data: Measured, now: Estimate, work: System, damping: float, b
                     y[p, i] += part * mixed[q, i]
             for i in range(width):
                 rhs[columns[i]] += y[p, i] * total
-            if n < len(work.whitened):
-                work.whitened[n, p, size] = total
-                for i in range(width):
-                    work.whitened[n, p, columns[i]] = y[p, i]
+            work.gradient[n, p] = total
         # two rows at a time share the loads; the last row of an odd width is computed twice
         for i in range(0, width, 2):
             m = min(i + 1, width - 1)
@@ -207,18 +205,27 @@ def reduce_system(data: Measured, now: Estimate, work: System, damping: float, b
 
 
 @compiled
-def step(data: Measured, now: Estimate, to: Estimate, work: System, variance: float) -> Any:
+def coupling(data: Measured, work: System, n: int) -> Any:
+    """Six rows of view n against the unknowns that it sees (`System.coupling`)."""
+    shared = int(data.with_focal) + int(data.with_k1)
+    each = 0 if data.points_known else 3
+    begin = 6 * (each * data.first[n] + shared * n)
+    width = each * (data.first[n + 1] - data.first[n]) + shared
+    return work.coupling[begin : begin + 6 * width].reshape(6, width)
+
+
+@compiled
+def step(data: Measured, now: Estimate, to: Estimate, work: System) -> Any:
     """Solve for the other unknowns, then each camera; False where the system is not positive definite."""
     if not solve(work.matrix, work.rhs):
         return False
     most = 0
     for n in range(len(now.rotation)):
         most = max(most, data.first[n + 1] - data.first[n])
-    a, rows, off = np.empty((6, 2 * most)), np.empty((3, 2 * most)), np.empty(2 * most)
-    lens, right, twist, turn = np.empty((2, 2 * most)), np.empty(6), np.empty(6), np.empty((3, 3))
     change, joints = work.rhs, len(now.points)
     points = 0 if data.points_known else 3 * joints
     shared = int(data.with_focal) + int(data.with_k1)
+    moved, twist, turn = np.empty(3 * most + shared), np.empty(6), np.empty((3, 3))
     for j in range(joints):
         for c in range(3):
             to.points[j, c] = now.points[j, c] + (change[c * joints + j] if points else 0.0)
@@ -227,28 +234,17 @@ def step(data: Measured, now: Estimate, to: Estimate, work: System, variance: fl
         for s in range(shared):
             to.intrinsics[g, 0 if data.with_focal and s == 0 else 1] += change[points + shared * g + s]
     for n in range(len(now.rotation)):
-        r, t, w = now.rotation[n], now.translation[n], work.whitener[n]
+        r, t, w, y = now.rotation[n], now.translation[n], work.whitener[n], coupling(data, work, n)
         begin, count = data.first[n], data.first[n + 1] - data.first[n]
-        fill_rows(data, now, work.weight, n, a, rows, off, lens)
-        if points:
+        width = 3 * count if points else 0
+        for c in range(3 if points else 0):
             for k in range(count):
-                for c in range(3):
-                    moved = change[c * joints + data.joint[begin + k]]
-                    off[k] += rows[c, k] * moved
-                    off[count + k] += rows[c, count + k] * moved
+                moved[c * count + k] = change[c * joints + data.joint[begin + k]]
         for s in range(shared):
-            moved = change[points + shared * data.lens[n] + s]
-            for k in range(2 * count):
-                off[k] += lens[s, k] * moved
+            moved[width + s] = change[points + shared * data.lens[n] + s]
         for p in range(6):
-            right[p] = dot(a[p], off, 2 * count)
-        if len(data.strength):
-            for c in range(3):
-                right[3 + c] += variance * data.strength[n] * orbit_error(data, now, n, c)
-        for p in range(6):
-            twist[p] = total = 0.0
-            for q in range(p + 1):
-                total += w[p, q] * right[q]
+            twist[p] = 0.0
+            total = work.gradient[n, p] + dot(y[p], moved, width + shared)
             for q in range(p + 1):
                 twist[q] -= w[p, q] * total
         exponential(twist, turn)

@@ -158,14 +158,6 @@ def test_what_is_read_is_what_was_solved(tmp_path, swapped_lap):
     assert again.names == again_scene.names == tuple(f"../scene/{name}" for name in scene.names)
 
 
-def test_want_of_precision_is_read_and_need_not_be_said(tmp_path, swapped_lap, edit):
-    scene, solution = swapped_lap
-    folder = written(tmp_path / "out", scene, replace(solution, imprecise=True))
-    assert read_solution(folder)[1].imprecise
-    edit(folder / "kronc.json", lambda record: record.pop("imprecise"))
-    assert not read_solution(folder)[1].imprecise
-
-
 def test_paths_that_were_rewritten_since_are_told_by_file_name(tmp_path, swapped_lap, edit):
     scene, solution = swapped_lap
     folder = written(tmp_path, scene, solution)

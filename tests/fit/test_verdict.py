@@ -276,20 +276,6 @@ def test_every_doubt_has_its_status_and_its_reason(scene, evidence, change, know
 
 
 @pytest.mark.parametrize(
-    ("known", "imprecise"),
-    [
-        ({}, False),
-        ({"sigma_rot_deg": np.full(VIEWS, 8.0)}, True),
-        ({"sigma_rot_deg": np.full(VIEWS, 1.9)}, True),
-        ({"sigma_rot_deg": np.full(VIEWS, 1.9), "converged": False}, False),
-        ({"shape_weight": 0.1}, False),
-    ],
-)
-def test_want_of_precision_alone_is_told_from_other_doubts(scene, evidence, known, imprecise):
-    assert judge(scene, replace(evidence, **known)).imprecise is imprecise
-
-
-@pytest.mark.parametrize(
     ("count", "shape_weight", "status"),
     [(0, 1.0, Status.FAILED), (2, None, Status.FAILED), (1, 1.0, Status.WEAK), (2, 1.0, Status.WEAK)],
 )

@@ -44,7 +44,7 @@ class Step:
         schur.reduce_system(data, self.now, self.work, damping, BELIEF, VARIANCE)
         lower = np.tril(self.work.matrix)
         self.matrix, self.rhs = lower + np.tril(lower, -1).T, self.work.rhs.copy()
-        self.solved = schur.step(data, self.now, self.to, self.work, VARIANCE)
+        self.solved = schur.step(data, self.now, self.to, self.work)
         self.state = state_of(self.to)
 
 

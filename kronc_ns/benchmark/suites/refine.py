@@ -15,7 +15,6 @@ from kronc_ns.benchmark.subjects import Subject, from_folder, thinned, with_nois
 from kronc_ns.benchmark.suites.degraded import Trouble, degraded, draw_trouble
 from kronc_ns.benchmark.suites.pose_measures import INTERVAL
 from kronc_ns.benchmark.suites.rows import Limit, Row
-from kronc_ns.benchmark.suites.trials import WRONG_DEG, WRONG_M
 from kronc_ns.capture.detection.choice import DetectorOptions
 from kronc_ns.capture.detection.finding import find_keypoints
 from kronc_ns.errors import KroncError
@@ -287,9 +286,6 @@ def _refined(subject: Subject, focal: float, trouble: Trouble, region: Region) -
         "focal_percent": 100 * abs(refined.camera.fx / true_focal - 1),
         **_intervals(refined, subject),
     }
-    cured = solution.status is Status.WEAK and refined.status is Status.CONVERGED
-    wrong = after["rotation_deg"] > WRONG_DEG or after["centre_cm"] > 100 * WRONG_M
-    figures |= {"cured": float(cured), "cured_wrong": float(cured and wrong)}
     if said.held_out_before_px and said.held_out_after_px:
         figures["gain"] = 1 - said.held_out_after_px / said.held_out_before_px
     return figures, refined
@@ -343,7 +339,7 @@ def _harm(walks: Sequence[Path], seed: int) -> Figures:
     try:
         figures, _ = _refined(subject, focal, trouble, "auto")
     except KroncError:
-        return {"harmed": 0.0, "cured_wrong": 0.0, "taken": 0.0, "solved": 0.0}
+        return {"harmed": 0.0, "taken": 0.0, "solved": 0.0}
     harmed = figures["taken"] > 0 and figures["rotation_deg"] > figures["before_deg"]
     return {**figures, "harmed": float(harmed), "solved": 1.0}
 

@@ -31,7 +31,7 @@ Shape = Float[np.ndarray, "66 3"]
 TUNING_TRIALS = 100_000
 """Trials from this number on are of the shapes to build on; those below are for reports."""
 _JUNK, _TWO_CARS = 0.05, 0.03  # shares of trials
-WRONG_DEG, WRONG_M = 3.0, 0.5  # mean errors from which on a scene is wrong
+_WRONG_DEG, _WRONG_M = 3.0, 0.5  # mean errors from which on a scene is wrong
 _RIGHT_DEG, _RIGHT_M = 1.5, 0.15  # and up to which it is right
 _OFF_DEG = 5.0  # error of a view that should not be called solved
 _NEAR_M = 0.1  # points that are off by more say little about the frame
@@ -114,7 +114,7 @@ def judge_trial(trial: Trial, solution: Solution) -> Figures:
     if usable and handed_on[0].mean() < _RIGHT_DEG and handed_on[1].mean() < _RIGHT_M:
         figures |= {"right": 1.0, "right_not_converged": float(not converged)}
     if converged:
-        wrong = rotation.mean() > WRONG_DEG or centre.mean() > WRONG_M
+        wrong = rotation.mean() > _WRONG_DEG or centre.mean() > _WRONG_M
         figures |= {"converged_wrong": float(wrong), "views": float(solved.sum())}
         figures["views_off"] = float((rotation > _OFF_DEG).sum())
         figures["rotations_within"] = float((rotation_z <= INTERVAL).sum())
