@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from threading import Barrier
+from unittest.mock import patch
 
 import numpy as np
 from jaxtyping import Float
@@ -192,10 +193,16 @@ def throughput(seed: int, count: int) -> Figures:
 
 
 def _in_processes(scenes: Sequence[Scene]) -> float:
-    """Seconds of one process for each core, all of them warm, each with its share of the scenes."""
+    """Seconds of one process for each core, all of them warm, each with its share of the scenes.
+
+    Each has one thread: those of their linear algebra would fight for the cores.
+    """
     cores = os.cpu_count() or 1
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(cores, context, _meet_at, (context.Barrier(cores),)) as pool:
+    with (
+        patch.dict(os.environ, {"OPENBLAS_NUM_THREADS": "1"}),
+        ProcessPoolExecutor(cores, context, _meet_at, (context.Barrier(cores),)) as pool,
+    ):
         return max(pool.map(_seconds_from_the_barrier, [scenes[core::cores] for core in range(cores)]))
 
 
