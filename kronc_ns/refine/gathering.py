@@ -17,7 +17,7 @@ from kronc_ns.solve.threads import side_by_side
 
 MOST_PX = 1280
 """Larger photos are made smaller: their finest detail is noise."""
-_SIFT_PX, _SIFT_PX_OF_MANY, _MANY = 640, 480, 30
+_SIFT_PX, _SIFT_PX_OF_MANY, _MANY = 640, 480, 50
 """SIFT doubles photos before it looks; where features are exactly is found later, in the larger pictures. From so many
 photos on there are features enough, and the finest are those least sure."""
 _FEATURES, _LEAST_OF_VIEW, _MOST_OF_VIEW = 100_000, 1_500, 4_000
