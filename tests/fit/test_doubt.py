@@ -38,3 +38,19 @@ def test_a_view_of_which_few_detections_agree_is_asked_and_told(attempt, met):
     behind = lead(astray(attempt, met))
     assert behind[VIEW] < 0
     assert np.isinf(np.delete(behind, VIEW)).all()
+
+
+def test_points_that_one_other_view_sees_speak_for_no_pose(attempt):
+    """They lie where this view sees them, wherever it stands."""
+    found, met = attempt.found, np.flatnonzero(attempt.inlier[VIEW])[:10]
+    keypoints = found.scene.keypoints.copy()
+    keypoints[VIEW, :, 2] = np.isin(np.arange(keypoints.shape[1]), met)
+    inlier = attempt.inlier.copy()
+    inlier[VIEW] = np.isin(np.arange(inlier.shape[1]), met)
+    known = replace(attempt, found=replace(found, scene=replace(found.scene, keypoints=keypoints)), inlier=inlier)
+    assert lead(known)[VIEW] > 3
+    alone = inlier.copy()
+    alone[np.arange(len(inlier)) > VIEW + 1] = False
+    alone[np.arange(len(inlier)) < VIEW] = False
+    assert (alone[:, met].sum(0) <= 2).all()
+    assert lead(replace(known, inlier=alone))[VIEW] <= 0
