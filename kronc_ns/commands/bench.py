@@ -44,7 +44,7 @@ class Bench:
     photos: Path | None = None
     """Of detector and refine: folder with spin_suv, captures, car_parts and cars; what it lacks is left out."""
     captures: Path | None = None
-    """Of refine: folder with rendered captures walk_* and hemi_*, as `kronc synth --render` makes them."""
+    """Of refine: folder with rendered captures walk_*, hemi_* and large_*, as `kronc synth --render` makes them."""
     detector_weights: Path | None = None
     """Of detector: other weights than the builtin ones."""
     keep: Path | None = None

@@ -115,7 +115,8 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> "Table
         table.add_row("views as given", f"{completed}, not solved")
     elif completed:
         table.add_row(
-            "views completed", f"{completed}: placed between their neighbours (--min-status solved omits them)"
+            "views completed",
+            f"{completed}: hardly known, or placed between their neighbours (--min-status solved omits them)",
         )
     if swapped:
         table.add_row("left and right", f"confused in {swapped} views, put right")
@@ -126,11 +127,12 @@ def report_table(report: Mapping[str, Any], notes: Sequence[str] = ()) -> "Table
     rmse, middle = report["rmse_px"], report["median_px"]
     if rmse is not None and middle is not None:
         table.add_row("reprojection", f"RMSE {rmse:.2f} px of the inliers, median {middle:.2f} px of all")
+    images = report.get("images")
     sigmas = [[view[key] for view in views if view.get(key) is not None] for key in ("sigma_rot_deg", "sigma_trans_m")]
     if all(sigmas):
         rotation, centre = (median(values) for values in sigmas)
-        table.add_row("standard deviation", f"{rotation:.2f} deg, {100 * centre:.1f} cm (median view)")
-    images = report.get("images")
+        among = ", of the cameras among each other" if images is not None and images["accepted"] else ""
+        table.add_row("standard deviation", f"{rotation:.2f} deg, {100 * centre:.2g} cm (median view{among})")
     if images is not None:
         taken = "taken" if images["accepted"] else "not taken"
         table.add_row("image features", f"{taken} ({images['seconds']:.1f} s): {images['reason']}")

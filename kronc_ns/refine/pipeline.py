@@ -190,7 +190,8 @@ def _taken(
     if solution.status is Status.CONVERGED:
         reason = f"{solved} of {len(scene)} views solved by image features; by keypoints alone {solution.reason}"
     else:  # where the car is among the cameras keypoints alone tell
-        reason = f"{solution.reason}; image features place {int(sure.sum())} views among each other all the same"
+        placed = f"image features place {int(sure.sum())} views among each other, but not the car among them"
+        reason = f"{placed}; by keypoints alone {solution.reason}"
     return replace(
         refined,
         reason=reason,

@@ -59,7 +59,8 @@ def test_features_leave_a_weak_solution_weak(walk, solved):
     assert found.images is not None
     assert found.images.accepted
     assert found.status is Status.WEAK
-    assert found.reason.startswith(f"known to 2.0 deg only; image features place {len(scene)} views")
+    assert found.reason.startswith(f"image features place {len(scene)} views among each other, but not the car")
+    assert found.reason.endswith("known to 2.0 deg only")
 
 
 def test_the_world_and_its_scale_stay(solved, refined):

@@ -51,8 +51,9 @@ def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[
 
     ``captures`` holds rendered ones, ``walk_*``, ``hemi_*`` and ``large_*``; ``photo_folder`` holds spin_suv.
     """
-    kinds = ("walk", "hemi", "large")
-    walks, spheres, large = ([path for path in _sorted(captures, f"{kind}_*") if path.is_dir()] for kind in kinds)
+    folders = sorted(path for path in captures.glob("*") if path.is_dir()) if captures else []
+    kinds = ("walk_", "hemi_", "large_")
+    walks, spheres, large = ([path for path in folders if path.name.startswith(kind)] for kind in kinds)
     rows: list[Row] = []
     missing = []
     if walks:
@@ -83,7 +84,10 @@ def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[
             )
         )
     else:
-        missing.append("no large walks: large_* in --captures, made by `kronc synth --render --views 100 --width 1920`")
+        missing.append(
+            "no large walks: --captures FOLDER with large_*, made by `kronc synth --render --preset walk --views 100 "
+            "--width 1920`"
+        )
     spin = photo_folder / "spin_suv" if photo_folder else None
     if spin is not None and spin.is_dir():
         rows.append(
@@ -105,10 +109,6 @@ def refine_rows(captures: Path | None, photo_folder: Path | None) -> tuple[list[
     else:
         missing.append("no spin_suv: --photos FOLDER")
     return rows, missing
-
-
-def _sorted(folder: Path | None, pattern: str) -> list[Path]:
-    return sorted(folder.glob(pattern)) if folder else []
 
 
 def _from_truth_row(name: str, measure: Callable[[int], Figures], seeds: int) -> Row:

@@ -161,7 +161,7 @@ def _left_out(
     unknown = [name for name, unsolved in zip(scene.schema.keypoints, missing, strict=True) if unsolved]
     said = [
         ("Views without a pose, which are not in transforms.json", failed),
-        ("Views placed between their neighbours (--min-status solved omits them)", completed),
+        ("Views hardly known, or placed between their neighbours (--min-status solved omits them)", completed),
         ("Views in which left and right were confused, and put right", swapped),
         ("Keypoints without a position, seen by too few solved views", unknown),
     ]
