@@ -25,9 +25,10 @@ POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
 _NOISY = 0.0065
 """Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
-_TWO_CARS = 0.31
-"""Share of the squared residuals that two shapes explain, from which on they are two: noise comes to 0.29 at most, the
-habits of a detector to 0.25, two cars mostly to 0.4 to 0.8."""
+_TWO_CARS, _TOGETHER, _HABITS = 0.31, 0.72, 0.45
+"""Share of the squared residuals that two shapes explain, from which on they are two (two cars come to 0.4 to 0.8,
+mostly); and from which on where more than this share of neighbouring views are of the same one, as the habits of a
+detector would have it, which come to 0.34."""
 _LEAST_FREEDOM, _LEAST_OF_VIEW = 40, 2.0
 """Measurements beyond the unknowns without which a fit tells little of its noise; and of a solved view, of whose points
 each takes three, shared by those that see it: fewer, and points are bent to where a wrong pose sees them."""
@@ -261,12 +262,12 @@ def _overall(
         problems.append(
             f"the keypoints fit poorly (noise {evidence.noise.sigma_px:.1f} px): are they all of one car, and right?"
         )
-    if evidence.two_cars.explained > _TWO_CARS:
-        other = np.flatnonzero(evidence.two_cars.other)
-        explained = f"two shapes explain {100 * evidence.two_cars.explained:.0f} % of what one misses"
+    explained, together, other_car = evidence.two_cars
+    if explained > (_HABITS if together > _TOGETHER else _TWO_CARS):
+        other = np.flatnonzero(other_car)
         problems.append(
             f"about {len(other)} of {views} views, {scene.names[other[0]]} the first, seem to show another car than "
-            f"the rest ({explained}): give one car at a time"
+            f"the rest (two shapes explain {100 * explained:.0f} % of what one misses): give one car at a time"
         )
     if 2 * count < views:
         problems.append(f"only {count} of {views} views are solved")

@@ -32,6 +32,8 @@ class _Search(Batched):
     cost: Float[Tensor, "b"]
     damping: Float[Tensor, "b"]
     rounds: Int[Tensor, "b"]
+    gain: Float[Tensor, "b"]
+    """Of the last step of this phase, 0 before there was one."""
 
 
 def gpu_is_there() -> bool:
@@ -83,6 +85,7 @@ def _adjust(
         cost=torch.full_like(sigma, torch.inf),
         damping=torch.full_like(sigma, START_DAMPING),
         rounds=torch.zeros_like(scenes),
+        gain=torch.zeros_like(sigma),
     )
     search = replace(search, cost=_cost(problem, search))
     detections = (problem.weight > 0).sum((1, 2)).clamp_min(1)
@@ -141,10 +144,12 @@ def _iterate(problem: Problems, search: _Search, config: LmConfig) -> tuple[_Sea
     cost = _cost(problem, attempt)
     better = cost < search.cost  # false for NaN
     coarse = search.phase == robust.CAUCHY
-    still = (search.cost - cost).abs() <= torch.where(coarse, robust.COARSE, config.tolerance) * search.cost
+    gain = robust.gain(search.cost, cost)
+    expected = torch.where(better, robust.next_gain(gain, search.gain), gain)
+    still = expected <= torch.where(coarse, robust.COARSE, config.tolerance)
     damping = torch.where(better, (search.damping / 10).clamp_min(LEAST_DAMPING), search.damping * 10)
     settled = still | (damping > MOST_DAMPING)
-    search = _choose(better, replace(attempt, cost=cost), search)
+    search = _choose(better, replace(attempt, cost=cost, gain=gain), search)
     return _follow(problem, replace(search, damping=damping.clamp(max=MOST_DAMPING)), settled)
 
 
@@ -171,6 +176,7 @@ def _follow(problem: Problems, search: _Search, settled: Bool[Tensor, "b"]) -> t
         phase=torch.where(settled & graduated, following, phase),
         sigma=torch.where(to_spread, spread, sigma),
         rounds=rounds,
+        gain=torch.where(settled, 0.0, search.gain),
     )
     return replace(search, cost=_cost(problem, search)), done
 

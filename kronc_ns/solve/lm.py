@@ -64,14 +64,17 @@ def adjust(
 
     sigma = noise()
     cost = schur.total_cost(data, now, sigma, phase)
-    damping, rounds, done = START_DAMPING, 0, False
+    damping, before, rounds, done = START_DAMPING, 0.0, 0, False
     losses: list[float] = []
     path: list[State] = []
     while len(losses) < config.iterations and not done:
         proposed = schur.propose(data, now, trial, work, sigma, phase, damping)
-        settled = abs(cost - proposed) <= (robust.COARSE if phase == robust.CAUCHY else config.tolerance) * cost
-        if proposed < cost:  # false for NaN
-            now, trial, cost = trial, now, proposed
+        gain = robust.gain(cost, proposed)
+        tolerance = robust.COARSE if phase == robust.CAUCHY else config.tolerance
+        better = proposed < cost  # false for NaN
+        settled = (robust.next_gain(gain, before) if better else gain) <= tolerance
+        if better:
+            now, trial, cost, before = trial, now, proposed, gain
             damping = max(damping / 10, LEAST_DAMPING)
         else:
             damping *= 10
@@ -83,7 +86,7 @@ def adjust(
             if phase != robust.TRIMMED:
                 sigma = shrunk
             if settled:
-                rounds += 1
+                rounds, before = rounds + 1, 0.0
                 phase, told, done = robust.next_phase(now.length, sigma, phase, shrunk, redundancy)
                 sigma = told if sigma_px is None else sigma_px
                 done = done or rounds >= robust.ROUNDS

@@ -33,6 +33,6 @@ class LmConfig:
     iterations: int = 200
     """Most iterations, rejected steps included."""
     tolerance: float = 1e-6
-    """Converged when a step lowers the cost by less than this share."""
+    """Converged when the next step is expected to lower the cost by less than this share."""
     loss: Loss = "cauchy"
     """cauchy: outliers lose influence and are left out at last; huber: they count linearly; none: in squares."""

@@ -30,7 +30,7 @@ REDUNDANCY_MOST = 1.6
 CAUCHY, TRIMMED, HUBER, SQUARES = 0, 1, 2, 3
 """Phases: the graduated Cauchy loss, trimmed squares after it; Huber's loss, or squares, throughout."""
 COARSE = 1e-2
-"""Tolerance of the graduated phase."""
+"""Tolerance of the graduated phase: the share of the cost that the next step may still gain."""
 LOOSE = 0.7
 """A scale that lags behind the residuals by more than this goes on with the graduated phase."""
 ROUNDS = 8
@@ -122,6 +122,16 @@ def shape_excess(surprise: Any, freedom: Any, size: Any) -> Any:
 def spread_px(squares: Any, count: Any, redundancy: Any) -> Any:
     """Noise per axis from the summed squares of so many inliers, before the floor."""
     return (squares / (2.0 * count)) ** 0.5 * redundancy
+
+
+def gain(cost: Any, proposed: Any) -> Any:
+    """The share of its cost by which a step changes it."""
+    return abs(cost - proposed) / (cost + 1e-12)
+
+
+def next_gain(last: Any, before: Any) -> Any:
+    """What the next step is expected to gain, if gains go on to shrink as from the one ``before`` (0: unknown)."""
+    return last * least(last / (before + 1e-12), 1.0)
 
 
 @compiled_briefly

@@ -53,6 +53,16 @@ def test_views_are_told_apart(mixed, monkeypatch):
     found = explained(scene, monkeypatch)
     assert (found.other == second).mean() >= 0.95
     assert found.explained > 0.55
+    assert 0.2 < found.together < 0.7  # mixed at random
+
+
+def test_two_cars_of_few_points_are_told_from_one(mixed):
+    """Neighbouring views have but a few points in common."""
+    scene, second = mixed
+    seen = scene.seen & (np.random.default_rng(7).uniform(size=scene.seen.shape) < 0.45)
+    sparse = replace(scene, keypoints=np.where(seen[..., None], scene.keypoints, 0.0))
+    assert 5 < seen.sum(1).mean() < 16
+    assert "seem to show another car" in solve_scene(sparse).reason
 
 
 @pytest.mark.parametrize("noise_px", [2.0, 3.0])
@@ -61,16 +71,27 @@ def test_noise_is_not_taken_for_another_car(noise_px, monkeypatch):
     assert explained(scene, monkeypatch).explained < 0.2
 
 
-def test_habits_of_a_detector_are_not_taken_for_another_car(monkeypatch):
+@pytest.mark.parametrize("views", [6, 9, 14])
+def test_noise_of_few_views_is_not_taken_for_another_car(views):
+    for seed in range(5):
+        scene = scene_of(make_capture("walk", views=views, seed=seed, noise_px=2.0, missing=0.3))
+        assert "another car" not in solve_scene(scene).reason
+
+
+@pytest.mark.parametrize("habit_px", [1.2, 3.0])
+def test_habits_of_a_detector_are_not_taken_for_another_car(habit_px, monkeypatch):
     """Its points are off by more than its noise, alike in views from one side."""
     capture = make_capture("walk", views=VIEWS, seed=4, noise_px=1.0)
     azimuth = np.arctan2(capture.c2w[:, 1, 3], capture.c2w[:, 0, 3])
     turns = np.stack([np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)  # once a lap would be another place
-    habits = np.random.default_rng(6).normal(0, 1.2, (2, 66, 2))
+    habits = np.random.default_rng(6).normal(0, habit_px, (2, 66, 2))
     keypoints = capture.keypoints.copy()
     keypoints[..., :2] += np.einsum("nk,kjc->njc", turns, habits)
     scene = scene_of(replace(capture, keypoints=np.where(capture.keypoints[..., 2:] > 0, keypoints, 0.0)))
-    assert 0 < explained(scene, monkeypatch).explained < 0.3
+    found = explained(scene, monkeypatch)
+    assert 0.05 < found.explained < 0.45
+    assert found.together > 0.8
+    assert "another car" not in solve_scene(scene).reason
 
 
 def test_few_views_are_not_asked(monkeypatch):

@@ -230,6 +230,21 @@ def test_too_few_iterations_are_no_convergence():
     assert np.isfinite(result.state.c2w).all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_default_tolerance_ends_where_a_small_one_does(seed):
+    """What the next step is expected to gain is all that is left."""
+    problem, truth = scene(views=20, joints=24, noise_px=1.0, seed=seed)
+    start = started(truth)
+    found, exact = (
+        adjust(problem, start, LmConfig(tolerance=tolerance)) for tolerance in (LmConfig().tolerance, 1e-14)
+    )
+    assert len(found.loss) < len(exact.loss)
+    assert found.cost == pytest.approx(exact.cost, rel=1e-7)
+    np.testing.assert_array_equal(found.inlier, exact.inlier)
+    moved, of_noise = (errors(found.state, end)[0] for end in (exact.state, truth))
+    assert moved.max() < 0.01 * of_noise.mean()
+
+
 def test_no_iterations_leave_the_start():
     problem, truth = scene(views=8, joints=16, noise_px=1.0)
     start = started(truth)

@@ -201,3 +201,12 @@ def test_redundancy_makes_up_for_what_the_unknowns_took():
     clear = rayleigh(1.0) / 1.4
     assert robust.next_phase(clear, 1.1, TRIMMED, 1.1, 1.4)[1] == pytest.approx(1.0, rel=0.03)
     assert robust.next_phase(clear, 1.1, TRIMMED, 0.9, 1.4)[1] == 0.9  # never more than the residuals show
+
+
+def test_the_next_gain_goes_on_as_gains_shrank():
+    assert robust.gain(200.0, 150.0) == robust.gain(200.0, 250.0) == pytest.approx(0.25)
+    assert robust.next_gain(0.01, 0.1) == pytest.approx(0.001)
+    assert robust.next_gain(0.1, 0.01) == 0.1  # gains that grow say nothing of an end
+    assert robust.next_gain(0.1, 0.0) == 0.1
+    assert robust.next_gain(0.0, 0.0) == robust.gain(0.0, 0.0) == 0.0
+    assert math.isnan(robust.next_gain(math.nan, 0.1))
