@@ -58,7 +58,7 @@ def test_views_are_told_apart(mixed, monkeypatch):
 
 def test_two_cars_of_few_points_are_told_from_one(mixed):
     """Neighbouring views have but a few points in common."""
-    scene, second = mixed
+    scene, _ = mixed
     seen = scene.seen & (np.random.default_rng(7).uniform(size=scene.seen.shape) < 0.45)
     sparse = replace(scene, keypoints=np.where(seen[..., None], scene.keypoints, 0.0))
     assert 5 < seen.sum(1).mean() < 16
