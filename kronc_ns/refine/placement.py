@@ -20,7 +20,7 @@ _RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricte
 _LEAST_OTHERS = 2  # views that a point must be seen in besides
 _TRIALS, _CONFIDENCE, _AGREES_PX = 3000, 0.9999, 4.0  # of RANSAC
 _CLOSER_PX = (4.0, 4.0, 2.0, 2.0)  # of matches that the pose is then fitted to, in turns
-_LEAST_AGREEING, _GAIN, _MORE = 15, 3, 4  # matches that the new pose explains: in all; over those of the old
+_LEAST_AGREEING, _GAIN, _MORE = 15, 1.5, 5  # matches that the new pose explains: in all; over those of the old
 
 
 def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"]) -> Rig:
@@ -105,7 +105,7 @@ def _pose(
         iterationsCount=_TRIALS,
         reprojectionError=_AGREES_PX,
         confidence=_CONFIDENCE,
-        flags=cv2.SOLVEPNP_SQPNP,
+        flags=cv2.SOLVEPNP_P3P,
     )
     if not found:
         return None

@@ -92,6 +92,18 @@ def test_a_view_that_was_placed_wrongly_is_found(deg):
     assert np.linalg.norm(found.cameras.centre - rig.cameras.centre, axis=1).max() < 0.01
 
 
+@pytest.mark.parametrize(("astray", "moves"), [(20, True), (45, False)])
+def test_a_wrong_pose_that_some_features_seem_to_confirm_gives_way_to_many_more(astray, moves):
+    """Guided matching finds chance matches along the lines of a wrong pose, which then follow it."""
+    rig, gathered, tracks = made(np.random.default_rng(3))
+    wrong = turned(rig, 5, 25.0)
+    seen = tracks.points[:astray] @ wrong.rotation[5].T + wrong.translation[5]
+    gathered.pixel[gathered.first[5] + np.arange(astray)] = seen[:, :2] / seen[:, 2:] * 500.0 + [320.0, 240.0]
+    found = relocated(Adjusted(wrong, tracks, gathered, 0.2, 1.0, 0.2), gathered, used(gathered))
+    off = rotation_angle_deg(found.rotation[5].T @ (rig if moves else wrong).rotation[5])
+    assert off < 0.1
+
+
 def test_views_that_lie_right_or_have_features_enough_stay():
     rig, gathered, tracks = made(np.random.default_rng(1))
     right = relocated(Adjusted(rig, tracks, gathered, 0.2, 0.2, 0.2), gathered, used(gathered))
