@@ -19,14 +19,13 @@ from kronc_ns.refine.placement import relocated
 from kronc_ns.refine.region import background_is_still, vehicle_features
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.search import Search, find_tracks, standing_features
-from kronc_ns.refine.tracks import Tracks, confirmed, enough, of_held_views, place
+from kronc_ns.refine.tracks import HELD_SHARE, Tracks, confirmed, enough, of_held_views, place
 from kronc_ns.refine.verdict import Evidence, weigh
 from kronc_ns.scene import Scene
 
 _HELD_OUT = 0.2  # share of the tracks that no fit sees
 _TRACKS_OF_VIEW = 400  # that are enough, once their places are those of patches
 _PAIRED = 20  # sightings of a view in tracks of three, below which its tracks of two count
-_HELD_SHARE = 0.1  # of the usual sightings of a view: fewer are as likely wrong, and keypoints place it better
 _ROUNDS, _SETTLED_DEG, _SETTLED_SIGMAS = 6, 0.05, 8.0  # of matching by the poses of features, until these turn less on
 # average, or less than so many times the noise of a feature: then they only follow it
 _FOR_FOCAL = 50  # tracks of a view that are enough to see whether the focal length is right
@@ -132,7 +131,7 @@ def _matched(
     aligned = align(tracks, gathered, latest.rig)
     tracks, aligned = grow(_placed(tracks, aligned, latest), aligned, latest.rig)
     tracks = confirmed(tracks, aligned.view, _PAIRED)
-    return of_held_views(tracks, aligned.view, _HELD_SHARE), aligned
+    return of_held_views(tracks, aligned.view, HELD_SHARE), aligned
 
 
 def _angles(rig: Rig) -> Float[np.ndarray, "n n"]:

@@ -14,11 +14,21 @@ from kronc_ns.refine.matching import Seen, match, standing_still
 from kronc_ns.refine.pairs import Bands, epipolar_bands, joint_covariance
 from kronc_ns.refine.region import compared_for_stillness, depth_range, still
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import LEAST_ANGLE_DEG, Linked, Tracks, angles_deg, link, place, pruned
+from kronc_ns.refine.tracks import (
+    HELD_SHARE,
+    LEAST_ANGLE_DEG,
+    Linked,
+    Tracks,
+    angles_deg,
+    link,
+    long_sightings,
+    place,
+    pruned,
+)
 from kronc_ns.solve.threads import side_by_side
 
 _BAND_SIGMAS = 3.0
-_FIRST_BAND_PX, _FIRST_WIDEST_PX = 1.5, 25.0  # least and most half width, before features were adjusted ...
+_FIRST_BAND_PX, _FIRST_WIDEST_PX = 1.5, 25.0  # least and most half width, before features hold a view ...
 _BAND_PX, _WIDEST_PX = 1.0, 6.0  # ... and after
 _BAND_NOISES = 2.5  # of the features' noise
 _OUTLIER_SIGMAS = 4.0
@@ -54,41 +64,51 @@ def find_tracks(
     distance = np.linalg.norm(rig.cameras.centre - middle, axis=1)
     covariance = joint_covariance(data, now, distance)
     noise = adjusted.sigma_px if adjusted else None
-    least, widest = (
-        (_FIRST_BAND_PX, _FIRST_WIDEST_PX) if noise is None else (max(_BAND_PX, _BAND_NOISES * noise), _WIDEST_PX)
-    )
+    least = _FIRST_BAND_PX if noise is None else max(_BAND_PX, _BAND_NOISES * noise)
+    free = _free(adjusted, len(rig.rotation))
 
     def bands_of(pairs: Int[np.ndarray, "p 2"]) -> Bands:
         return epipolar_bands(pairs, now, covariance, middle, rig.focal)
 
-    def half_width(band: Float[np.ndarray, "p"]) -> Float[np.ndarray, "p"]:
+    def half_width(band: Float[np.ndarray, "p"], pairs: Int[np.ndarray, "p 2"]) -> Float[np.ndarray, "p"]:
+        widest = np.where(free[pairs].any(1), _FIRST_WIDEST_PX, _WIDEST_PX)
         return np.minimum(np.hypot(_BAND_SIGMAS * band, least), widest)
 
     uv = rig.ideal(gathered.pixel, gathered.view)
     bands = bands_of(search.pairs)
+    at_car, far = (half_width(of, search.pairs) for of in (bands.at_car, bands.far))
     matches = Linked.of(
         [
-            *_compared(gathered, search, rig, uv, half_width(bands.at_car), half_width(bands.far), distance),
-            _followed(gathered, search, rig, uv, lambda pairs: half_width(bands_of(pairs).at_car)),
+            *_compared(gathered, search, rig, uv, at_car, far, distance),
+            _followed(gathered, search, rig, uv, lambda pairs: half_width(bands_of(pairs).at_car, pairs)),
         ]
     )
     strict = np.zeros(len(gathered.view), bool)
     strict[matches.here[matches.strict]] = strict[matches.there[matches.strict]] = True
+    vague = np.zeros(len(rig.rotation))
+    for column in search.pairs.T:
+        np.maximum.at(vague, column, np.minimum(bands.far, _VAGUE_PX))
     if noise is None:
-        vague = np.zeros(len(rig.rotation))
-        for column in search.pairs.T:
-            np.maximum.at(vague, column, np.minimum(bands.far, _VAGUE_PX))
         scale = float(np.clip(np.median(bands.far), *_SCALE_PX)) if len(bands.far) else _SCALE_PX[0]
-        of_view = np.maximum(_OUTLIER_SIGMAS * np.hypot(scale, 1.0), _BAND_SIGMAS * np.hypot(vague, 1.0))
+        outlier = _OUTLIER_SIGMAS * np.hypot(scale, 1.0)
     else:
         scale = max(0.5, 1.5 * noise)
-        of_view = np.full(len(rig.rotation), _OUTLIER_SIGMAS * max(noise, 0.3))
+        outlier = _OUTLIER_SIGMAS * max(noise, 0.3)
+    of_view = np.where(free, np.maximum(outlier, _BAND_SIGMAS * np.hypot(vague, 1.0)), outlier)
     limit = of_view[gathered.view]
     tracks = link(matches, gathered.view)
     for _ in range(2):  # the points move where outliers leave
         tracks, error = place(tracks, uv, gathered.view, rig.cameras, scale)
         tracks = pruned(tracks, error < limit[tracks.feature], strict)
     return tracks.chosen(angles_deg(tracks, gathered.view, rig.cameras) > LEAST_ANGLE_DEG)
+
+
+def _free(adjusted: Adjusted | None, views: int) -> Bool[np.ndarray, "n"]:
+    """Views that features do not hold yet, which are searched as widely as at first."""
+    if adjusted is None:
+        return np.ones(views, bool)
+    seen = long_sightings(adjusted.tracks, adjusted.gathered.view, views)
+    return seen < HELD_SHARE * np.median(seen)
 
 
 def standing_features(

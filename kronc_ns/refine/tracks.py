@@ -13,6 +13,8 @@ from kronc_ns.solve.projection import BEHIND_PX
 
 LEAST_ANGLE_DEG = 1.0
 """Rays that are more parallel tell nothing of a point."""
+HELD_SHARE = 0.1
+"""Of the usual sightings of a view: fewer are as likely wrong, and keypoints place it better."""
 _STRICT_RATIO, _STRICT_SIMILAR = 0.7, 0.9  # of tracks of two views, which nothing else confirms
 
 
