@@ -81,7 +81,7 @@ def evidence_of(solution: Solution) -> Evidence:
         iterations=10,
         lead=np.full(len(solution.views), np.inf),
         noise=Noise(1.0, 1.0, 500),
-        two_cars=TwoCars(0.0, np.zeros(len(solution.views), dtype=bool)),
+        two_cars=TwoCars(0.0, 1.0, np.zeros(len(solution.views), dtype=bool)),
     )
 
 

@@ -38,7 +38,7 @@ def evidence(lap) -> Evidence:
         iterations=12,
         lead=np.full(VIEWS, math.inf),
         noise=Noise(0.7, 1.0, 500),
-        two_cars=TwoCars(0.0, np.zeros(VIEWS, dtype=bool)),
+        two_cars=TwoCars(0.0, 1.0, np.zeros(VIEWS, dtype=bool)),
     )
 
 
@@ -206,7 +206,7 @@ def test_few_views_must_be_known_better(evidence, scene, views, status):
     every = slice(None, None, VIEWS // views)
     chosen = replace(scene, names=scene.names[every][:views], keypoints=scene.keypoints[every][:views])
     known = {name: getattr(evidence, name)[every][:views] for name in ("c2w", "sigma_trans_m", "swapped", "lead")}
-    alone = TwoCars(0.0, np.zeros(views, dtype=bool))
+    alone = TwoCars(0.0, 1.0, np.zeros(views, dtype=bool))
     few = replace(evidence, **known, sigma_rot_deg=np.full(views, 1.4), two_cars=alone)
     assert judge(chosen, few).status is status
 
@@ -242,11 +242,23 @@ def test_views_without_enough_agreement_say_so(scene, evidence):
 
 # ---- what is said of the whole
 
+OTHER = np.arange(VIEWS) < 8
+
 
 @pytest.mark.parametrize(
     ("change", "known", "status", "reason"),
     [
-        ({}, {"shape_weight": 0.1}, Status.WEAK, "hardly look like a car"),
+        ({}, {"shape_weight": 0.45}, Status.WEAK, "hardly look like a car"),
+        ({}, {"shape_weight": 0.55}, Status.CONVERGED, "20 of 20 views solved"),
+        (
+            {},
+            {"two_cars": TwoCars(0.4, 0.5, OTHER)},
+            Status.WEAK,
+            "about 8 of 20 views, images/frame_00001.png the first",
+        ),
+        ({}, {"two_cars": TwoCars(0.4, 0.9, OTHER)}, Status.CONVERGED, "20 of 20 views solved"),
+        ({}, {"two_cars": TwoCars(0.5, 0.9, OTHER)}, Status.WEAK, "two shapes explain 50 % of what one misses"),
+        ({}, {"two_cars": TwoCars(0.3, 0.5, OTHER)}, Status.CONVERGED, "20 of 20 views solved"),
         ({}, {"shape_weight": None}, Status.CONVERGED, "20 of 20 views solved"),
         ({}, {"sigma_rot_deg": np.full(VIEWS, 8.0)}, Status.WEAK, "0 of 20 views are well determined"),
         ({}, {"sigma_rot_deg": np.full(VIEWS, 8.0)}, Status.WEAK, "8.0 deg): take more views"),
