@@ -99,7 +99,7 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
     planned = len(search.pairs)
     for _ in range(_ROUNDS):
         earlier = latest.rig
-        latest = replace(latest, rig=relocated(latest, gathered, search.used))
+        latest = _mended(latest, gathered, search)
         search = replace(search, pairs=choose_pairs(_angles(latest.rig)))
         counter.expect(len(search.pairs) - planned)
         planned = 0
@@ -120,6 +120,13 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
         evidence = replace(evidence, focal_growth=freed.rig.focal / latest.rig.focal)
     final = adjust(believed, _placed(tracks, aligned, latest), aligned, latest.rig, config, latest.sigma_px)
     return Found(final, believed, evidence)
+
+
+def _mended(latest: Adjusted, gathered: Gathered, search: Search) -> Adjusted:
+    """With views that stood wrong placed anew; what others saw together with these says nothing of them."""
+    rig = relocated(latest, gathered, search.used)
+    moved = (rig.rotation != latest.rig.rotation).any((1, 2))
+    return replace(latest, rig=rig, tracks=_without(latest.tracks, moved[latest.gathered.view]))
 
 
 def _matched(

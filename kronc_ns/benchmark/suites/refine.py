@@ -183,6 +183,7 @@ def _walk_rows(walks: Sequence[Path]) -> list[Row]:
             _from_truth_row(name, partial(_from_truth, walks, draw=draw, trouble=trouble), count)
             for name, draw, trouble in (
                 ("walk, 25 %, poor keypoints", poor, _PLAIN),
+                ("walk, 25 %, builtin detector", _Draw(0.25, detect=True), _PLAIN),
                 ("vehicle alone", _Draw(), white),
                 ("vehicle alone, 25 %", quarter, white),
             )
