@@ -23,13 +23,14 @@ from kronc_ns.solve.robust import INLIER_SIGMAS, noise_px
 MIN_VIEWS = 3
 POOR_FIT = 0.01
 """A median residual above this share of the image diagonal is no fit (a detector's noise is 0.1 to 0.4 %)."""
-_NOISY = 0.0065
-"""Noise above this share of the image diagonal is that of no detector: two cars that are taken for one have it."""
+_NOISY, _NEARLY_ALL = 0.0065, 0.8
+"""Noise above this share of the image diagonal, with less than this share of the views solved, is that of two cars that
+are taken for one; a poor detector has the noise, but its views fit all the same."""
 _TWO_CARS, _TOGETHER, _HABITS = 0.31, 0.72, 0.45
 """Share of the squared residuals that two shapes explain, from which on they are two (two cars come to 0.4 to 0.8,
 mostly); and from which on where more than this share of neighbouring views are of the same one, as the habits of a
 detector would have it, which come to 0.34."""
-_LEAST_FREEDOM, _LEAST_OF_VIEW = 40, 2.0
+_LEAST_FREEDOM, _LEAST_OF_VIEW = 20, 2.0
 """Measurements beyond the unknowns without which a fit tells little of its noise; and of a solved view, of whose points
 each takes three, shared by those that see it: fewer, and points are bent to where a wrong pose sees them."""
 SURE_DEG, SURE_SHARE = 2.0, 0.03
@@ -42,9 +43,9 @@ _LEAST_LEAD = 3.0
 """Detections by which a solved view's pose is better than any other."""
 _MOST_ACCIDENTS = -4.0
 """Decimal logarithm of the number of wrong poses that are expected to meet a solved view's detections as well."""
-_LEAST_SOLVED = 0.4
-"""Share of views without which the others' poses are not believed: of those, one in 200 is off by more than 5 degrees,
-eight times as many as elsewhere."""
+_LEAST_SOLVED = 0.5
+"""Share of views without which the others' poses are not believed: below it, one scene in 18 that would converge has a
+view that is off by more than 5 degrees, one in 100 above it; and two cars that are taken for one hardly pass it."""
 _PARALLAX_DEG = 3.0
 """Views that see the points from within this angle hardly tell how far these are."""
 _ALIKE = 0.005
@@ -259,7 +260,7 @@ def _overall(
         problems.append(f"only {count} view{'s' * (count > 1)}: nothing but the car template holds them together")
     elif evidence.noise.freedom < _LEAST_FREEDOM:
         problems.append("the views share so few keypoints that any poses would meet them: take more views")
-    if evidence.noise.sigma_px > _NOISY * _diagonal(scene):
+    if evidence.noise.sigma_px > _NOISY * _diagonal(scene) and sure < _NEARLY_ALL * views:
         problems.append(
             f"the keypoints fit poorly (noise {evidence.noise.sigma_px:.1f} px): are they all of one car, and right?"
         )
