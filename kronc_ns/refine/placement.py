@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import long_sightings
+from kronc_ns.refine.tracks import loose_views
 
 _LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewhere
 _RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricter
@@ -29,10 +29,9 @@ def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"
     ``used`` are the features that may be matched.
     """
     rig = adjusted.rig
-    sightings = long_sightings(adjusted.tracks, adjusted.gathered.view, len(rig.rotation))
-    loose = np.flatnonzero(sightings < _LOOSE * np.median(sightings))
+    loose = loose_views(adjusted.tracks, adjusted.gathered.view, len(rig.rotation), _LOOSE)
     rotation, translation = rig.rotation.copy(), rig.translation.copy()
-    for view in loose.tolist():
+    for view in np.flatnonzero(loose).tolist():
         points, uv = _matched(adjusted, gathered, gathered, used, view, rig, of_it=view)
         found = _pose(points, uv, rig.focal)
         if found is None:

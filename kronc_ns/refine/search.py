@@ -21,7 +21,7 @@ from kronc_ns.refine.tracks import (
     Tracks,
     angles_deg,
     link,
-    long_sightings,
+    loose_views,
     place,
     pruned,
 )
@@ -107,8 +107,7 @@ def _free(adjusted: Adjusted | None, views: int) -> Bool[np.ndarray, "n"]:
     """Views that features do not hold yet, which are searched as widely as at first."""
     if adjusted is None:
         return np.ones(views, bool)
-    seen = long_sightings(adjusted.tracks, adjusted.gathered.view, views)
-    return seen < HELD_SHARE * np.median(seen)
+    return loose_views(adjusted.tracks, adjusted.gathered.view, views, HELD_SHARE)
 
 
 def standing_features(

@@ -138,10 +138,15 @@ def confirmed(tracks: Tracks, view: Int[np.ndarray, "f"], least: int) -> Tracks:
     return tracks.chosen(long | pairs)
 
 
+def loose_views(tracks: Tracks, view: Int[np.ndarray, "f"], views: int, share: float) -> Bool[np.ndarray, "n"]:
+    """Which views have less than a ``share`` of the usual sightings in tracks of three views or more."""
+    seen = long_sightings(tracks, view, views)
+    return seen < share * np.median(seen)
+
+
 def of_held_views(tracks: Tracks, view: Int[np.ndarray, "f"], share: float) -> Tracks:
-    """The tracks less the sightings of views that have less than a share of the usual sightings in tracks of three."""
-    seen = long_sightings(tracks, view, int(view.max(initial=0)) + 1)
-    keep = (seen >= share * np.median(seen))[view[tracks.feature]]
+    """The tracks less the sightings of `loose_views`."""
+    keep = ~loose_views(tracks, view, int(view.max(initial=0)) + 1, share)[view[tracks.feature]]
     left = rows_of(tracks.feature[keep], tracks.of_track[keep], tracks.points)
     return left.chosen(left.lengths >= 2)
 

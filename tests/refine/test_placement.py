@@ -16,6 +16,8 @@ from kronc_ns.refine.keypoints import MOST_ALIKE, KeypointTracks, alike
 from kronc_ns.refine.pipeline import refine_scene
 from kronc_ns.refine.placement import placed, relocated
 from kronc_ns.refine.rig import Rig
+from kronc_ns.refine.rounds import _mended
+from kronc_ns.refine.search import Search, find_tracks
 from kronc_ns.refine.tracks import Linked, of_held_views, rows_of
 from kronc_ns.solution import ViewStatus
 
@@ -146,6 +148,37 @@ def test_sightings_of_views_that_features_hardly_hold_are_left_out():
     assert (np.delete(seen, 5) == 80).all()
     same = of_held_views(tracks, gathered.view, 0.01)
     np.testing.assert_array_equal(same.feature, tracks.feature)
+
+
+def seen_of(tracks, gathered, view: int) -> int:
+    return int((gathered.view[tracks.feature] == view).sum())
+
+
+def found_in_tilted(hidden_from: int) -> int:
+    """Features of view 5 that are found though its pose has them 13 px off, where ``hidden_from`` has few tracks."""
+    rig, gathered, tracks = made(np.random.default_rng(6), hidden_from=hidden_from)
+    rotation = rig.rotation.copy()
+    rotation[5] = so3_exp(np.array([13 / 500, 0.0, 0.0])) @ rotation[5]
+    tilted = replace(rig, rotation=rotation, keypoints=tracks.points[:12])
+    keypoints = detections(tilted, tracks.points[:12], np.zeros((8, 12, 2)))
+    search = Search(np.stack(np.triu_indices(8, 1), axis=1), used(gathered), False, lambda: None)
+    again = find_tracks(gathered, search, tilted, keypoints, Adjusted(tilted, tracks, gathered, 0.2, 0.2, 0.2))
+    return seen_of(again, gathered, 5)
+
+
+def test_a_view_that_features_do_not_hold_is_searched_for_as_widely_as_at_first():
+    assert found_in_tilted(hidden_from=5) > 1.5 * found_in_tilted(hidden_from=0)
+
+
+def test_what_was_seen_with_a_view_that_moved_is_believed_no_more():
+    rig, gathered, tracks = made(np.random.default_rng(7))
+    search = Search(np.zeros((0, 2), np.int64), used(gathered), False, lambda: None)
+    mended = _mended(Adjusted(turned(rig, 5, 25.0), tracks, gathered, 0.2, 1.0, 0.2), gathered, search)
+    assert rotation_angle_deg(mended.rig.rotation[5].T @ rig.rotation[5]) < 0.1
+    assert seen_of(mended.tracks, gathered, 5) == 0
+    assert len(mended.tracks) == len(tracks) - 4  # the four that it had seen
+    left = _mended(Adjusted(rig, tracks, gathered, 0.2, 0.2, 0.2), gathered, search)
+    assert len(left.tracks) == len(tracks)
 
 
 def detections(rig: Rig, points, noise):
