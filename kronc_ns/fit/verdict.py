@@ -43,9 +43,11 @@ _LEAST_LEAD = 3.0
 """Detections by which a solved view's pose is better than any other."""
 _MOST_ACCIDENTS = -4.0
 """Decimal logarithm of the number of wrong poses that are expected to meet a solved view's detections as well."""
-_LEAST_SOLVED = 0.5
+_LEAST_SOLVED, _ALL_AGREE, _CLEAN = 0.5, 0.97, 0.005
 """Share of views without which the others' poses are not believed: below it, one scene in 18 that would converge has a
-view that is off by more than 5 degrees, one in 100 above it; and two cars that are taken for one hardly pass it."""
+view that is off by more than 5 degrees, one in 100 above it; and two cars that are taken for one hardly pass it. Unless
+this share of views at least is vague at worst, with noise below this share of the diagonal: then nothing speaks against
+the poses but that they are not known well."""
 _PARALLAX_DEG = 3.0
 """Views that see the points from within this angle hardly tell how far these are."""
 _ALIKE = 0.005
@@ -149,7 +151,7 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     finite = error[np.isfinite(error)]
     median = float(np.median(finite)) if len(finite) else math.inf
     vague = agree & alone & meant & ~(checked & sure)
-    status, reason = _overall(scene, evidence, solved, agree, median)
+    status, reason = _overall(scene, evidence, solved, vague, agree, median)
     return Verdict(
         views,
         status,
@@ -240,6 +242,7 @@ def _overall(
     scene: Scene,
     evidence: Evidence,
     solved: Bool[np.ndarray, "n"],
+    vague: Bool[np.ndarray, "n"],
     agreeing: Bool[np.ndarray, "n"],
     median_px: float,
 ) -> tuple[Status, str]:
@@ -253,6 +256,8 @@ def _overall(
         return Status.FAILED, f"{count} of {views} views agree with each other, expected at least {MIN_VIEWS}; {fit}"
     if share > POOR_FIT:
         return Status.FAILED, f"the keypoints do not fit together: {fit}, expected below {100 * POOR_FIT:g} %"
+    sigma_px, diagonal = evidence.noise.sigma_px, _diagonal(scene)
+    undisputed = int((solved | vague).sum()) >= _ALL_AGREE * views and sigma_px <= _CLEAN * diagonal
     problems = []
     if not evidence.converged:
         problems.append(f"the solver was still moving after {evidence.iterations} steps: allow more")
@@ -260,10 +265,8 @@ def _overall(
         problems.append(f"only {count} view{'s' * (count > 1)}: nothing but the car template holds them together")
     elif evidence.noise.freedom < _LEAST_FREEDOM:
         problems.append("the views share so few keypoints that any poses would meet them: take more views")
-    if evidence.noise.sigma_px > _NOISY * _diagonal(scene) and sure < _NEARLY_ALL * views:
-        problems.append(
-            f"the keypoints fit poorly (noise {evidence.noise.sigma_px:.1f} px): are they all of one car, and right?"
-        )
+    if sigma_px > _NOISY * diagonal and sure < _NEARLY_ALL * views:
+        problems.append(f"the keypoints fit poorly (noise {sigma_px:.1f} px): are they all of one car, and right?")
     explained, together, other_car = evidence.two_cars
     if explained > (_HABITS if together > _TOGETHER else _TWO_CARS):
         other = np.flatnonzero(other_car)
@@ -273,7 +276,7 @@ def _overall(
         )
     if 2 * count < views:
         problems.append(f"only {count} of {views} views are solved")
-    elif sure < max(MIN_VIEWS, _LEAST_SOLVED * views):
+    elif sure < MIN_VIEWS or (sure < _LEAST_SOLVED * views and not undisputed):
         sigma = evidence.sigma_rot_deg[agreeing]
         typical = float(np.median(sigma[np.isfinite(sigma)])) if np.isfinite(sigma).any() else math.nan
         problems.append(

@@ -271,11 +271,24 @@ OTHER = np.arange(VIEWS) < 8
         ),
         ({}, {"sigma_rot_deg": np.array([0.3] * 12 + [1.9] * 8)}, Status.CONVERGED, "20 of 20 views solved"),
         ({}, {"converged": False}, Status.WEAK, "still moving after 12 steps"),
+        ({}, {"sigma_rot_deg": np.array([0.2] * 9 + [8.0] * 11)}, Status.CONVERGED, "9 of 20 views solved"),
         (
             {},
+            {"sigma_rot_deg": np.array([0.2] * 9 + [8.0] * 11), "noise": Noise(3.0, 1.0, 500)},
+            Status.WEAK,
+            "only 9 of 20 views are well determined",
+        ),
+        (
+            {"odd": [19]},
             {"sigma_rot_deg": np.array([0.2] * 9 + [8.0] * 11)},
             Status.WEAK,
             "only 9 of 20 views are well determined",
+        ),
+        (
+            {},
+            {"sigma_rot_deg": np.array([0.2] * 2 + [8.0] * 18)},
+            Status.WEAK,
+            "only 2 of 20 views are well determined",
         ),
         (
             {},
