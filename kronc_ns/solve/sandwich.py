@@ -3,29 +3,24 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from kronc_ns.solve.compiled import compiled
 from kronc_ns.solve.elimination import Reduced, columns_of, reduce, sighting
 from kronc_ns.solve.sightings import Sightings, Unknowns
 
 
-def sandwich(
-    data: Sightings, now: Unknowns, group: Int[np.ndarray, "s"], common_px: float
-) -> tuple[Float[np.ndarray, "f f"], Float[np.ndarray, "f f"]]:
+def sandwich(data: Sightings, now: Unknowns) -> tuple[Float[np.ndarray, "f f"], Float[np.ndarray, "f f"]]:
     """What the covariance at a minimum is made of (Huber, 1967): the reduced system with the loss's own curvature, and
     the summed outer products of what each point pulls the reduced unknowns by.
 
-    The sightings of one point may err together, and those of a ``group`` (below 0: of none) have an error of
-    ``common_px`` along each axis in common. The curvature of Cauchy's loss is, on average over directions, its IRLS
+    The sightings of one point may err together. The curvature of Cauchy's loss is, on average over directions, its IRLS
     weight squared: with the weight itself covariances would come out too small.
     """
     room, scores = Reduced.of(data), np.zeros((data.unknowns, data.unknowns))
     reduce(data, now, 0.0, True, room)
     _scores(data, now, room, scores)
-    common = np.zeros((2 * (int(group.max(initial=-1)) + 1), data.unknowns))
-    _common_scores(data, now, room, group, common)
-    return room.matrix[0], scores + common_px**2 * (common.T @ common)
+    return room.matrix[0], scores
 
 
 @compiled
@@ -56,36 +51,3 @@ def _scores(data: Any, now: Any, room: Any, out: Any) -> None:
                     row, own = out[columns[i, k]], pulls[i, k]
                     for m in range(width):
                         row[columns[j, m]] += own * pulls[j, m]
-
-
-@compiled
-def _common_scores(data: Any, now: Any, room: Any, group: Any, out: Any) -> None:
-    """What an error of a pixel along x, and along y, in all sightings of a group pulls the reduced unknowns by."""
-    intrinsics = int(data.with_focal) + int(data.with_k1)
-    width = 6 + intrinsics
-    camera, point, off = np.empty((2, 8)), np.empty((2, 3)), np.empty(3)
-    columns, shift = np.empty(8, np.int64), np.empty(3)
-    for p in range(len(data.first) - 1):
-        begin, end = data.first[p], data.first[p + 1]
-        inverse = room.inverse[p]
-        for o in range(begin, end):
-            if group[o] < 0:
-                continue
-            weight = sighting(data, now, p, o, camera, point, off)
-            if weight == 0.0:
-                continue
-            weight *= off[2]
-            for axis in range(2):
-                row = out[2 * group[o] + axis]
-                columns_of(data, o, intrinsics, columns)
-                for k in range(width):
-                    row[columns[k]] += weight * camera[axis, k]
-                for c in range(3):
-                    shift[c] = weight * (
-                        inverse[c, 0] * point[axis, 0] + inverse[c, 1] * point[axis, 1] + inverse[c, 2] * point[axis, 2]
-                    )
-                for other in range(begin, end):
-                    columns_of(data, other, intrinsics, columns)
-                    for k in range(width):
-                        w = room.mixed[other]
-                        row[columns[k]] -= w[0, k] * shift[0] + w[1, k] * shift[1] + w[2, k] * shift[2]

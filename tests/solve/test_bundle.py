@@ -142,7 +142,6 @@ def test_the_sandwich_is_the_spread_of_estimates():
     weight = np.full(len(clean.camera), NOISE**-2)
     clean = clean._replace(weight=weight, scale=np.full(len(weight), NOISE))
     draws, predicted = [], []
-    group = np.full(len(weight), -1)
     gauge = np.linalg.qr(gauge_of(truth, clean.unknowns))[0]
     project = np.eye(clean.unknowns) - gauge @ gauge.T
     for _ in range(150):
@@ -155,24 +154,10 @@ def test_the_sandwich_is_the_spread_of_estimates():
         )
         v = found.translation - np.einsum("nij,nj->ni", turn, truth.translation)
         draws.append(project @ np.concatenate([w, v], axis=1).ravel())
-        matrix, scores = sandwich.sandwich(data, found, group, 0.0)
+        matrix, scores = sandwich.sandwich(data, found)
         inverse = project @ np.linalg.inv(matrix + np.trace(matrix) * (gauge @ gauge.T))
         predicted.append(np.diag(inverse @ scores @ inverse.T))
     measured = 2 * len(weight) - truth.points.size
     taken_up = measured / (measured - clean.unknowns + 7)  # of the noise, by the cameras
     ratio = np.sqrt(taken_up * np.mean(predicted, axis=0) / np.var(draws, axis=0))
     assert 0.8 < np.median(ratio) < 1.15
-
-
-def test_errors_in_common_are_counted_once():
-    rng = np.random.default_rng(9)
-    data, now = problem(rng, views=4, points=50)
-    group = np.where(data.camera == 1, 0, -1)
-    room = elimination.Reduced.of(data)
-    elimination.reduce(data, now, 0.0, True, room)
-    common = np.zeros((2, data.unknowns))
-    sandwich._common_scores(data, now, room, group, common)
-    # an error of all sightings of camera 1 along x is a gradient of the reduced system
-    shifted = data._replace(uv=data.uv - np.where((data.camera == 1)[:, None], [1e-3, 0.0], 0.0))
-    elimination.reduce(shifted, now, 0.0, False, room)
-    np.testing.assert_allclose(common[0], room.gradient[0] / 1e-3, atol=1e-3 * np.abs(common[0]).max())
