@@ -30,7 +30,8 @@ class Detect:
     num_frames: int = 100
     """Frames taken from a video: the sharpest of as many equal spans of time, unless nothing has moved."""
     pictures: Flag = False
-    """Draw what was found: pictures/NAME.jpg, the car's own left orange, its right blue, large where less sure."""
+    """Draw what was found: pictures/NAME.jpg, in subfolders as the photos are; the car's own left orange, its right
+    blue, large where less sure."""
 
     def run(self) -> int:
         """Detect and write. Returns 3 where no image shows a car, else 0."""
@@ -87,7 +88,9 @@ class Detect:
         write_keypoints(file, detector.schema, found.size, dict(zip(names, rows, strict=True)), sigma)
         if self.pictures:
             for i, (name, image) in enumerate(zip(names, images, strict=True)):
-                target = self.output_dir / "pictures" / f"{Path(name).name.removesuffix('.jpg')}.jpg"
+                within = name.removeprefix("images/").removesuffix(".jpg")
+                target = self.output_dir / "pictures" / f"{within}.jpg"
+                target.parent.mkdir(parents=True, exist_ok=True)
                 write_marked(target, image, sizes[i], detector.schema, rows[i], None if sigma is None else sigma[i])
         counts = (rows[..., 2] > 0).sum(1)
         if not counts.any():

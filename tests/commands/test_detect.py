@@ -60,6 +60,15 @@ def test_photos(detect, tmp_path: Path):
     assert detect("--data", photos, "--output-dir", out).refused("already holds")
 
 
+def test_photos_of_equal_names_in_subfolders_have_a_picture_each(detect, tmp_path: Path):
+    for folder, box in zip(("near", "far"), BOXES, strict=False):
+        save(tmp_path / "photos" / folder / "a.png", draw_cars(SIZE, box))
+    out = tmp_path / "out"
+    assert detect("--data", tmp_path / "photos", "--output-dir", out, "--pictures").status == 0
+    drawn = {str(path.relative_to(out)) for path in (out / "pictures").rglob("*.jpg")}
+    assert drawn == {"pictures/near/a.png.jpg", "pictures/far/a.png.jpg"}
+
+
 def test_one_photo_turned_by_its_exif(detect, tmp_path: Path):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
