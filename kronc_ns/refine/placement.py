@@ -8,14 +8,16 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
+from kronc_ns.refine.pairs import view_angles
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import loose_views
+from kronc_ns.refine.tracks import loose_views, without
 
 _LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewhere
+_ACROSS_DEG, _RUN = 90.0, 0.25  # of views on the other side of the car than those before and after
 _RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricter
 _LEAST_OTHERS = 2  # views that a point must be seen in besides
 _TRIALS, _CONFIDENCE, _AGREES_PX = 3000, 0.9999, 4.0  # of RANSAC
@@ -24,15 +26,20 @@ _LEAST_AGREEING, _GAIN, _MORE = 15, 1.5, 5  # matches that the new pose explains
 
 
 def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"]) -> Rig:
-    """The cameras, those with few features where more of them agree; the others as they were.
+    """The cameras, those with few features, and those across the car, where more features agree; others as they were.
 
     ``used`` are the features that may be matched.
     """
-    rig = adjusted.rig
-    loose = loose_views(adjusted.tracks, adjusted.gathered.view, len(rig.rotation), _LOOSE)
+    rig, view_of = adjusted.rig, adjusted.gathered.view
+    count = len(rig.rotation)
     rotation, translation = rig.rotation.copy(), rig.translation.copy()
-    for view in np.flatnonzero(loose).tolist():
-        points, uv = _matched(adjusted, gathered, gathered, used, view, rig, of_it=view)
+    run = across(view_angles(rig.cameras.centre, np.nanmean(rig.keypoints, axis=0)))
+    for view in np.flatnonzero(loose_views(adjusted.tracks, view_of, count, _LOOSE) | (run > 0)).tolist():
+        believed, own = adjusted, np.arange(count) == view
+        if run[view]:  # they confirm each other, and what else they seem to see is chance
+            own = run == run[view]
+            believed = replace(adjusted, tracks=without(adjusted.tracks, own[view_of]))
+        points, uv = _matched(believed, gathered, gathered, used, view, rig, own)
         found = _pose(points, uv, rig.focal)
         if found is None:
             continue
@@ -42,11 +49,31 @@ def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"
     return replace(rig, rotation=rotation, translation=translation)
 
 
+def across(angles: Float[np.ndarray, "n n"]) -> Int[np.ndarray, "n"]:
+    """Runs of views, numbered from 1 on (0: of none), that are seen from across the car while those before and after
+    them in the order of the photos are not: front and rear, taken for each other.
+
+    ``angles`` are degrees between the directions from which views see the car.
+    """
+    count = len(angles)
+    run = np.zeros(count, np.int64)
+    for length in range(1, int(_RUN * count) + 1):
+        first = np.arange(1, count - length)
+        before, after = first - 1, first + length
+        inside = first[:, None] + np.arange(length)
+        far = np.minimum(angles[before[:, None], inside], angles[after[:, None], inside]) > _ACROSS_DEG
+        for begin in first[(angles[before, after] < _ACROSS_DEG) & far.all(1)].tolist():
+            if not run[begin : begin + length].any():
+                run[begin : begin + length] = run.max() + 1
+    return run
+
+
 def placed(adjusted: Adjusted, gathered: Gathered, absent: Gathered, used: Bool[np.ndarray, "f"], rig: Rig) -> Rig:
     """``rig``, of views that took no part and have the features ``absent``, with poses; NaN where these tell none."""
     rotation, translation = np.full_like(rig.rotation, np.nan), np.full_like(rig.translation, np.nan)
     for view in range(len(rotation)):
-        found = _pose(*_matched(adjusted, gathered, absent, used, view, rig), rig.focal)
+        nobody = np.zeros(len(adjusted.rig.rotation), bool)
+        found = _pose(*_matched(adjusted, gathered, absent, used, view, rig, nobody), rig.focal)
         if found is not None:
             rotation[view], translation[view] = found
     return replace(rig, rotation=rotation, translation=translation)
@@ -59,14 +86,14 @@ def _matched(
     may: Bool[np.ndarray, "f"],
     view: int,
     rig: Rig,
-    of_it: int = -1,
+    own_views: Bool[np.ndarray, "n"],
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 2"]]:
     """Points that look like features that a view of ``seen`` may use, and where it has them in ideal pixels of ``rig``.
 
-    What the view ``of_it`` of the adjustment sees does not count.
+    What ``own_views`` of the adjustment see does not count.
     """
     tracks = adjusted.tracks
-    elsewhere = adjusted.gathered.view[tracks.feature] != of_it
+    elsewhere = ~own_views[adjusted.gathered.view[tracks.feature]]
     believed = np.bincount(tracks.of_track[elsewhere], minlength=len(tracks)) >= _LEAST_OTHERS
     used = elsewhere & (tracks.feature < gathered.sift) & believed[tracks.of_track]
     own = np.arange(seen.first[view], seen.first[view + 1])

@@ -19,7 +19,7 @@ from kronc_ns.refine.placement import relocated
 from kronc_ns.refine.region import background_is_still, vehicle_features
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.search import Search, find_tracks, standing_features
-from kronc_ns.refine.tracks import HELD_SHARE, Tracks, confirmed, enough, of_held_views, place
+from kronc_ns.refine.tracks import HELD_SHARE, Tracks, confirmed, enough, of_held_views, place, without
 from kronc_ns.refine.verdict import Evidence, weigh
 from kronc_ns.scene import Scene
 
@@ -91,7 +91,7 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
     reserved = tracks.chosen(rng.random(len(tracks)) < _HELD_OUT)
     held = np.zeros(len(gathered.view), bool)
     held[reserved.feature] = True
-    fitted = confirmed(_without(tracks, held), gathered.view, _PAIRED)
+    fitted = confirmed(without(tracks, held), gathered.view, _PAIRED)
     fitted = enough(fitted, gathered.view, _TRACKS_OF_VIEW, rng)
     if not len(fitted):
         return None
@@ -105,7 +105,7 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
         planned = 0
         believed = keypoints.noisier(alike(keypoints, start, latest.rig))
         tracks, aligned = _matched(gathered, search, latest, believed, rng)
-        known = _without(tracks, np.pad(held, (0, len(aligned.view) - len(held))))
+        known = without(tracks, np.pad(held, (0, len(aligned.view) - len(held))))
         if not len(known):
             return None
         latest = adjust(believed, known, aligned, latest.rig, config)
@@ -126,7 +126,7 @@ def _mended(latest: Adjusted, gathered: Gathered, search: Search) -> Adjusted:
     """With views that stood wrong placed anew; what others saw together with these says nothing of them."""
     rig = relocated(latest, gathered, search.used)
     moved = (rig.rotation != latest.rig.rotation).any((1, 2))
-    return replace(latest, rig=rig, tracks=_without(latest.tracks, moved[latest.gathered.view]))
+    return replace(latest, rig=rig, tracks=without(latest.tracks, moved[latest.gathered.view]))
 
 
 def _matched(
@@ -150,10 +150,3 @@ def _placed(tracks: Tracks, gathered: Gathered, adjusted: Adjusted) -> Tracks:
     """Tracks with their points where adjusted cameras see them."""
     rig = adjusted.rig
     return place(tracks, rig.ideal(gathered.pixel, gathered.view), gathered.view, rig.cameras, adjusted.sigma_px)[0]
-
-
-def _without(tracks: Tracks, held: Bool[np.ndarray, "f"]) -> Tracks:
-    """The tracks that have no feature that is held out."""
-    out = np.zeros(len(tracks), bool)
-    out[tracks.of_track[held[tracks.feature]]] = True
-    return tracks.chosen(~out)

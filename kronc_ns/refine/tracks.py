@@ -144,6 +144,13 @@ def loose_views(tracks: Tracks, view: Int[np.ndarray, "f"], views: int, share: f
     return seen < share * np.median(seen)
 
 
+def without(tracks: Tracks, held: Bool[np.ndarray, "f"]) -> Tracks:
+    """The tracks that have none of the features that are held out."""
+    out = np.zeros(len(tracks), bool)
+    out[tracks.of_track[held[tracks.feature]]] = True
+    return tracks.chosen(~out)
+
+
 def of_held_views(tracks: Tracks, view: Int[np.ndarray, "f"], share: float) -> Tracks:
     """The tracks less the sightings of `loose_views`."""
     keep = ~loose_views(tracks, view, int(view.max(initial=0)) + 1, share)[view[tracks.feature]]

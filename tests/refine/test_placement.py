@@ -14,7 +14,7 @@ from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.keypoints import MOST_ALIKE, KeypointTracks, alike
 from kronc_ns.refine.pipeline import refine_scene
-from kronc_ns.refine.placement import placed, relocated
+from kronc_ns.refine.placement import across, placed, relocated
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.rounds import _mended
 from kronc_ns.refine.search import Search, find_tracks
@@ -148,6 +148,40 @@ def test_sightings_of_views_that_features_hardly_hold_are_left_out():
     assert (np.delete(seen, 5) == 80).all()
     same = of_held_views(tracks, gathered.view, 0.01)
     np.testing.assert_array_equal(same.feature, tracks.feature)
+
+
+def test_neighbours_that_stand_across_the_car_together_are_found_though_they_confirm_each_other():
+    """A detector takes the front for the rear in photos side by side; what these share fits where they are put."""
+    rig = ring(12)
+    rng = np.random.default_rng(8)
+    points = rng.uniform([-2, -1, 0], [2, 1, 1.5], (80, 3))
+    gathered = features(rig, points, rng, 0.2, unlike=30)
+    together = np.isin(np.arange(12), (4, 5, 6))
+    here = np.concatenate([np.tile(~together, (40, 1)), np.tile(together, (40, 1))])
+    numbers = np.arange(12)[None] * 110 + np.arange(80)[:, None]
+    around = so3_exp(np.array([0.0, 0.0, np.pi]))
+    carried = np.concatenate([points[:40], points[40:] @ around])
+    tracks = rows_of(numbers[here], np.repeat(np.arange(80), here.sum(1)), carried)
+    rotation = np.where(together[:, None, None], rig.rotation @ around, rig.rotation)
+    wrong = Adjusted(replace(rig, rotation=rotation), tracks, gathered, 0.2, 0.2, 0.2)
+    found = relocated(wrong, gathered, used(gathered))
+    assert rotation_angle_deg(found.rotation @ rig.rotation.transpose(0, 2, 1)).max() < 0.1
+    assert np.linalg.norm(found.cameras.centre - rig.cameras.centre, axis=1).max() < 0.01
+
+
+def test_runs_across_the_car_are_told_from_laps_and_from_jumps():
+    def between(azimuth):
+        off = np.abs(np.subtract.outer(azimuth, azimuth)) % 360
+        return np.minimum(off, 360 - off)
+
+    lap = 25.0 * np.arange(12)
+    assert not across(between(lap)).any()
+    assert not across(between(np.concatenate([lap[:6], lap[:6] + 180]))).any()  # goes on there
+    turned = lap.copy()
+    turned[[2, 7, 8]] += 180
+    assert across(between(turned)).tolist() == [0, 0, 1, 0, 0, 0, 0, 2, 2, 0, 0, 0]
+    turned[3:8] = lap[3:8] + 180
+    assert not across(between(turned))[3:8].any()  # too many of them to be the wrong ones
 
 
 def seen_of(tracks, gathered, view: int) -> int:
