@@ -74,7 +74,7 @@ def test_the_nodes_share_the_work(cluster, many, same, tmp_path):
 
 def test_killed_workers_lose_nothing(cluster, many, same, tmp_path):
     scratch = tmp_path / "scratch"
-    with _killing("ray::kronc_fleet", times=3, every_s=4.0) as killed:
+    with _killing("ray::kronc_fleet", times=3, every_s=1.0) as killed:
         summary = run_fleet(str(many), str(tmp_path / "out"), replace(QUICK, scratch=scratch, retries=3), ray=cluster)
     assert killed, "nobody was killed"
     assert summary.counts == {"converged": MANY}
