@@ -88,9 +88,7 @@ class Detect:
         write_keypoints(file, detector.schema, found.size, dict(zip(names, rows, strict=True)), sigma)
         if self.pictures:
             for i, (name, image) in enumerate(zip(names, images, strict=True)):
-                within = name.removeprefix("images/").removesuffix(".jpg")
-                target = self.output_dir / "pictures" / f"{within}.jpg"
-                target.parent.mkdir(parents=True, exist_ok=True)
+                target = self.output_dir / "pictures" / _within(name)
                 write_marked(target, image, sizes[i], detector.schema, rows[i], None if sigma is None else sigma[i])
         counts = (rows[..., 2] > 0).sum(1)
         if not counts.any():
@@ -100,6 +98,12 @@ class Detect:
         several = f"; {note}" if "several" in note else ""
         print(f"{len(seen)} of {len(names)} images show the car, {seen.mean():.1f} points each{several}: {file}")
         return 0
+
+
+def _within(name: str) -> Path:
+    """Where an image's picture goes; in a folder of ours, wherever transforms.json says that the image is."""
+    path = Path(name.removeprefix("images/").removesuffix(".jpg") + ".jpg")
+    return Path(*(part for part in path.parts if part not in ("..", path.anchor)))
 
 
 def _upright(images: Sequence[Path], folder: Path) -> list[Path]:

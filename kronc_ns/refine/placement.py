@@ -51,7 +51,8 @@ def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"
 
 def across(angles: Float[np.ndarray, "n n"]) -> Int[np.ndarray, "n"]:
     """Runs of views, numbered from 1 on (0: of none), that are seen from across the car while those before and after
-    them in the order of the photos are not: front and rear, taken for each other.
+    them in the order of the photos are not: front and rear, taken for each other. The first and the last view have
+    nobody on one side, and are of none.
 
     ``angles`` are degrees between the directions from which views see the car.
     """
@@ -71,8 +72,8 @@ def across(angles: Float[np.ndarray, "n n"]) -> Int[np.ndarray, "n"]:
 def placed(adjusted: Adjusted, gathered: Gathered, absent: Gathered, used: Bool[np.ndarray, "f"], rig: Rig) -> Rig:
     """``rig``, of views that took no part and have the features ``absent``, with poses; NaN where these tell none."""
     rotation, translation = np.full_like(rig.rotation, np.nan), np.full_like(rig.translation, np.nan)
+    nobody = np.zeros(len(adjusted.rig.rotation), bool)
     for view in range(len(rotation)):
-        nobody = np.zeros(len(adjusted.rig.rotation), bool)
         found = _pose(*_matched(adjusted, gathered, absent, used, view, rig, nobody), rig.focal)
         if found is not None:
             rotation[view], translation[view] = found

@@ -69,6 +69,22 @@ def test_photos_of_equal_names_in_subfolders_have_a_picture_each(detect, tmp_pat
     assert drawn == {"pictures/near/a.png.jpg", "pictures/far/a.png.jpg"}
 
 
+def test_no_photo_is_drawn_over_wherever_a_scene_folder_says_that_it_is(detect, tmp_path: Path):
+    scene, out = tmp_path / "scene", tmp_path / "out"
+    near, far = tmp_path / "photos/a.jpg", tmp_path / "elsewhere/b.jpg"
+    for photo in (near, far):
+        save(photo, draw_cars(SIZE, BOXES[0]))
+    width, height = SIZE
+    lens = {"fl_x": 500.0, "fl_y": 500.0, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
+    frames = [{"file_path": "../photos/a.jpg"}, {"file_path": str(far)}]
+    scene.mkdir()
+    (scene / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    before = contents(tmp_path)
+    assert detect("--data", scene, "--output-dir", out, "--pictures").status == 0
+    assert {path: made for path, made in contents(tmp_path).items() if path in before} == before
+    assert len([*(out / "pictures").rglob("*.jpg")]) == 2
+
+
 def test_one_photo_turned_by_its_exif(detect, tmp_path: Path):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
