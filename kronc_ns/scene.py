@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from kronc_ns.errors import KroncError
 from kronc_ns.geometry.camera import Camera, Lenses, rays
@@ -59,6 +59,11 @@ class Scene:
         return self.keypoints[..., 2] > 0
 
     @cached_property
+    def visible(self) -> Int[np.ndarray, "n"]:
+        """How many keypoints were found in each view."""
+        return self.seen.sum(1)
+
+    @cached_property
     def visibility(self) -> Float[np.ndarray, "n j"]:
         """The paper's m: 1 where a keypoint was found, else 0."""
         return self.seen.astype(np.float64)
@@ -100,7 +105,7 @@ class Scene:
     def uv(self) -> Float[np.ndarray, "n j 2"]:
         """Pixels with lens distortion removed, as `camera` would have seen them."""
         if self.lenses is None:
-            return self.camera.undistort(self.keypoints[..., :2])
+            return np.ascontiguousarray(self.camera.undistort(self.keypoints[..., :2]))
         uv = np.empty(self.keypoints[..., :2].shape)
         for lens, camera in enumerate(self.lenses.cameras):
             own = self.lenses.of_view == lens

@@ -63,10 +63,15 @@ class Attempt:
         of_noise = camera_covariance(self.problem, self.state, self.inlier, self.noise.sigma_px, self.shape_weight)
         return self.noise.widening**2 * of_noise
 
-    @property
+    @cached_property
+    def met(self) -> Int[np.ndarray, "n"]:
+        """How many detections of each view are inliers."""
+        return self.inlier.sum(1)
+
+    @cached_property
     def agreeing(self) -> Bool[np.ndarray, "n"]:
         """Views that `agrees` with the solved points."""
-        return agrees(self.inlier.sum(1), self.found.scene.seen.sum(1))
+        return agrees(self.met, self.found.scene.visible)
 
 
 def agrees(inliers: Int[np.ndarray, "n"], seen: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
@@ -135,7 +140,8 @@ def _attempt(start: Hypothesis, found: Hypothesis, problem: Problem, result: LmR
 
 def kept_steps(count: int) -> list[int]:
     """A few of the steps on the way, evenly spread."""
-    return np.round(np.linspace(0, count - 1, min(count, _STEPS_KEPT))).astype(int).tolist()
+    kept = min(count, _STEPS_KEPT)
+    return [round(i * (count - 1) / max(kept - 1, 1)) for i in range(kept)]
 
 
 def _posed(found: Hypothesis) -> Float[np.ndarray, "n 3 4"]:

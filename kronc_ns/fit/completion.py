@@ -30,6 +30,8 @@ def complete(
     does not tell it better.
     """
     solved, vague = verdict.solved, verdict.vague
+    if solved.all():
+        return evidence.c2w, verdict.views
     c2w = np.where((solved | vague)[:, None, None], evidence.c2w, math.nan)
     sigma_rot, sigma_trans = (np.where(vague, of, math.nan) for of in (evidence.sigma_rot_deg, evidence.sigma_trans_m))
     walk = _walk(evidence, solved)
@@ -60,7 +62,7 @@ def complete(
 
 def _walk(evidence: Evidence, solved: Bool[np.ndarray, "n"]) -> Interpolated | None:
     """The walk of the solved views around the z axis through the car."""
-    if not solved.any() or solved.all():
+    if not solved.any():
         return None
     points = np.isfinite(evidence.points).all(-1)
     middle = evidence.points[points].mean(0) if points.any() else np.zeros(3)

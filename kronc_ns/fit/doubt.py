@@ -28,8 +28,8 @@ def lead(attempt: Attempt) -> Float[np.ndarray, "n"]:
     Infinite for views with so many that agree that there is no need to ask.
     """
     found = attempt.found
-    scene, inliers = found.scene, attempt.inlier.sum(1)
-    asked = found.used & (inliers >= MIN_POINTS) & ~plenty(inliers, scene.seen.sum(1))
+    scene, inliers = found.scene, attempt.met
+    asked = found.used & (inliers >= MIN_POINTS) & ~plenty(inliers, scene.visible)
     ahead = np.full(len(scene), math.inf)
     if not asked.any():
         return ahead

@@ -67,21 +67,21 @@ def _suspects(attempt: Attempt) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray,
 
 def _doubtful(attempt: Attempt) -> Bool[np.ndarray, "n"]:
     """Views that fit with so few detections, or so few of them, that another pose may fit better."""
-    scene, inliers = attempt.found.scene, attempt.inlier.sum(1)
-    few = (inliers < _PLENTY) | (inliers < _PLENTY_SHARE * scene.seen.sum(1))
+    scene, inliers = attempt.found.scene, attempt.met
+    few = (inliers < _PLENTY) | (inliers < _PLENTY_SHARE * scene.visible)
     return usable_views(scene) & attempt.found.used & few
 
 
 def _misfits(attempt: Attempt) -> Bool[np.ndarray, "n"]:
     """Views that the noise does not explain."""
-    few = 2 * attempt.inlier.sum(1) < attempt.found.scene.seen.sum(1)
+    few = 2 * attempt.met < attempt.found.scene.visible
     return ~attempt.agreeing | few
 
 
 def _looks_through(attempt: Attempt) -> Bool[np.ndarray, "n"]:
     """Views that see too much of the car's far side: confused sides, or a car of another shape than the template."""
-    seen = attempt.found.scene.seen
-    return (attempt.found.far_side & seen).sum(1) > _ODD_SHARE * seen.sum(1)
+    scene = attempt.found.scene
+    return (attempt.found.far_side & scene.seen).sum(1) > _ODD_SHARE * scene.visible
 
 
 def _relocated(attempt: Attempt, suspect: Bool[np.ndarray, "n"], doubtful: Bool[np.ndarray, "n"]) -> Hypothesis | None:
@@ -106,7 +106,7 @@ def _relocated(attempt: Attempt, suspect: Bool[np.ndarray, "n"], doubtful: Bool[
         exchanged = locate(single_views(mirror, points, fitting, sigma))
         c2w[fitting], swapped[fitting] = invert(exchanged.w2c), True
         cost[fitting] = np.where(exchanged.cost < SWAP_GAIN * present[fitting], exchanged.cost, math.inf)
-    gain = np.where(doubtful, _CLEAR_GAIN / np.maximum(scene.seen.sum(1), 1), 0.0)
+    gain = np.where(doubtful, _CLEAR_GAIN / np.maximum(scene.visible, 1), 0.0)
     better = (suspect | doubtful) & (cost < present - gain)
     used = np.where(better, cost < LOST, found.used & (attempt.agreeing | ~suspect))
     if not better.any() and np.array_equal(used, found.used):

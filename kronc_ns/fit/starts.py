@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from kronc_ns.fit.car_frame import rough_frame
 from kronc_ns.fit.options import Direction, KroncConfig
-from kronc_ns.geometry.camera import rays, reproject
+from kronc_ns.geometry.camera import lengths, rays, reproject
 from kronc_ns.geometry.poses import invert, look_at
 from kronc_ns.geometry.triangulation import triangulate
 from kronc_ns.keypoints.template import car_template
@@ -57,7 +57,7 @@ class Hypothesis:
     @cached_property
     def error_px(self) -> Float[np.ndarray, "n j"]:
         """Distance of every detection from its point; inf behind a camera and where either has no place."""
-        error = np.hypot(self.off_px[..., 0], self.off_px[..., 1])
+        error = lengths(self.off_px)
         return np.where(np.isnan(error), np.inf, error)
 
     @cached_property
@@ -77,7 +77,7 @@ def normals(scene: Scene) -> Float[np.ndarray, "j 3"]:
 
 def usable_views(scene: Scene) -> Bool[np.ndarray, "n"]:
     """Views with enough keypoints to be solved."""
-    return scene.seen.sum(1) >= MIN_POINTS
+    return scene.visible >= MIN_POINTS
 
 
 def circular_poses(

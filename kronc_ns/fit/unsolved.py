@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from kronc_ns.geometry.camera import rays, reproject
+from kronc_ns.geometry.camera import lengths, rays, reproject
 from kronc_ns.geometry.poses import camera_z
 from kronc_ns.geometry.triangulation import triangulate
 from kronc_ns.scene import Scene
@@ -22,10 +22,9 @@ def unsolved(scene: Scene) -> Solution:
     c2w = scene.given_c2w
     assert c2w is not None
     points = _meeting_points(scene, c2w)
-    off = reproject(points, c2w, scene.camera) - scene.uv
-    error = np.hypot(off[..., 0], off[..., 1])
+    error = lengths(reproject(points, c2w, scene.camera) - scene.uv)
     known = scene.seen & np.isfinite(error)
-    visible = scene.seen.sum(1).tolist()
+    visible = scene.visible.tolist()
     return Solution(
         status=Status.WEAK,
         reason="poses are as they were given, nothing was solved (solver none)",

@@ -14,7 +14,7 @@ from kronc_ns.fit.doubt import plenty
 from kronc_ns.fit.noise import Noise
 from kronc_ns.fit.starts import MIN_POINTS
 from kronc_ns.fit.two_cars import TwoCars
-from kronc_ns.geometry.camera import Camera, reproject
+from kronc_ns.geometry.camera import Camera, lengths, reproject
 from kronc_ns.geometry.poses import posed, unit
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution, Status, ViewReport, ViewStatus
@@ -114,8 +114,7 @@ def residuals_px(
     scene: Scene, camera: Camera, c2w: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, "n j"]:
     """Reprojection error of every detection against the solved points; NaN where there is none, inf behind a camera."""
-    off = reproject(points, c2w, camera) - scene.uv
-    error = np.hypot(off[..., 0], off[..., 1])
+    error = lengths(reproject(points, c2w, camera) - scene.uv)
     return np.where(scene.seen & posed(c2w)[:, None] & np.isfinite(points).all(-1), error, math.nan)
 
 
@@ -130,7 +129,7 @@ def judge(scene: Scene, evidence: Evidence) -> Verdict:
     """A report on every view and the overall status."""
     error = residuals_px(scene, evidence.camera, evidence.c2w, evidence.points)
     inlier = _small(scene, error)
-    counted, found, good = (~np.isnan(error)).sum(1), scene.seen.sum(1), inlier.sum(1)
+    counted, found, good = (~np.isnan(error)).sum(1), scene.visible, inlier.sum(1)
     rmse = np.sqrt(np.where(inlier, error**2, 0.0).sum(1) / np.maximum(good, 1))
     agree = agrees(good, counted)
     distance = _distance(evidence)
@@ -332,7 +331,7 @@ def _all_alike(scene: Scene, solved: Bool[np.ndarray, "n"]) -> bool:
     uv = np.where(seen[..., None], scene.uv[chosen], math.inf)
     middle = np.sort(uv, axis=0)[np.maximum(seen.sum(0) - 1, 0) // 2, np.arange(seen.shape[1])]
     off = uv[seen] - np.broadcast_to(middle, uv.shape)[seen]
-    return float(np.median(np.hypot(off[:, 0], off[:, 1]))) < _ALIKE * _diagonal(scene)
+    return float(np.median(lengths(off))) < _ALIKE * _diagonal(scene)
 
 
 def _diagonal(scene: Scene) -> float:

@@ -17,10 +17,8 @@ from kronc_ns.solve import records, schur
 from kronc_ns.solve.compiled import compiled
 from kronc_ns.solve.linear import dot, factor, forward
 from kronc_ns.solve.problem import Problem, State
-from kronc_ns.solve.threads import in_parts
 
 _TRACE = 1e-9  # of the gauge's directions, where points are too few to tell them apart
-_PARTS, _MANY = 2, 32  # from so many cameras on they are computed in parts, one for each core
 _DAMPING = 1e-9  # keeps the gauge's zero pivots positive
 
 
@@ -53,38 +51,20 @@ def camera_covariance(
         covariance[:] = np.nan
         return covariance
     forward(matrix, gauge)
-    shared = gauge @ gauge.T
-    parts = _PARTS if len(covariance) >= _MANY else 1
-    edges = np.linspace(0, len(covariance), parts + 1).astype(int).tolist()
-    in_parts(
-        lambda part: _cameras(
-            data, now, work, edges[part], edges[part + 1], gauge, shared, inverse, mean, sigma_px**2, covariance
-        ),
-        parts,
-    )
+    _cameras(data, now, work, gauge, gauge @ gauge.T, inverse, mean, sigma_px**2, covariance)
     return covariance
 
 
 @compiled
 def _cameras(
-    data: Any,
-    now: Any,
-    work: Any,
-    begin: int,
-    end: int,
-    gauge: Any,
-    shared: Any,
-    inverse: Any,
-    mean: Any,
-    variance: float,
-    out: Any,
+    data: Any, now: Any, work: Any, gauge: Any, shared: Any, inverse: Any, mean: Any, variance: float, out: Any
 ) -> None:
-    """The covariances of some cameras."""
+    """The covariances of all cameras."""
     size, joints = len(work.matrix), len(now.points)
     intrinsics = int(data.with_focal) + int(data.with_k1)
     points = 0 if data.points_known else 3 * joints
     z = np.empty((6, size))
-    for n in range(begin, end):
+    for n in range(len(out)):
         y = schur.coupling(data, work, n)
         first, count = data.first[n], data.first[n + 1] - data.first[n]
         for p in range(6):

@@ -118,22 +118,31 @@ def solve(matrix: Any, rhs: Any) -> Any:
 @compiled_briefly
 def forward(lower: Any, rows: Any) -> None:
     """Every row x becomes the solution y of ``lower`` y = x; entries past its size stay. Rows in multiples of 6."""
+    size = len(lower)
     for p in range(0, len(rows), 6):
         x0, x1, x2, x3, x4, x5 = rows[p], rows[p + 1], rows[p + 2], rows[p + 3], rows[p + 4], rows[p + 5]
-        for i in range(len(lower)):
-            row, inverse = lower[i], 1.0 / lower[i, i]
+        if size % 2:
+            for x in (x0, x1, x2, x3, x4, x5):
+                x[0] /= lower[0, 0]
+        for i in range(size % 2, size, 2):  # two unknowns at a time share the loads
+            row, next_row = lower[i], lower[i + 1]
             s0 = s1 = s2 = s3 = s4 = s5 = 0.0
+            t0 = t1 = t2 = t3 = t4 = t5 = 0.0
             for k in range(i):
-                f = row[k]
+                f, g = row[k], next_row[k]
                 s0 += f * x0[k]
                 s1 += f * x1[k]
                 s2 += f * x2[k]
                 s3 += f * x3[k]
                 s4 += f * x4[k]
                 s5 += f * x5[k]
-            x0[i] = (x0[i] - s0) * inverse
-            x1[i] = (x1[i] - s1) * inverse
-            x2[i] = (x2[i] - s2) * inverse
-            x3[i] = (x3[i] - s3) * inverse
-            x4[i] = (x4[i] - s4) * inverse
-            x5[i] = (x5[i] - s5) * inverse
+                t0 += g * x0[k]
+                t1 += g * x1[k]
+                t2 += g * x2[k]
+                t3 += g * x3[k]
+                t4 += g * x4[k]
+                t5 += g * x5[k]
+            a, b, c = 1.0 / row[i], 1.0 / next_row[i + 1], next_row[i]
+            for x, s, t in ((x0, s0, t0), (x1, s1, t1), (x2, s2, t2), (x3, s3, t3), (x4, s4, t4), (x5, s5, t5)):
+                x[i] = (x[i] - s) * a
+                x[i + 1] = (x[i + 1] - t - c * x[i]) * b

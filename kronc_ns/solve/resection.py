@@ -82,7 +82,8 @@ def locate(views: Views, exact: bool = False, rival: Int[np.ndarray, "m"] | None
         view, w2c, unexplained = view[chosen], w2c[chosen], unexplained[chosen]
         last = kept == 1
         if last and exact:
-            view, w2c = np.concatenate([view, np.arange(number)]), np.concatenate([w2c, _consensus(views)])
+            left = np.unique(view)  # what is given up would take all samples, in vain
+            view, w2c = np.concatenate([view, left]), np.concatenate([w2c, _consensus(views, left)])
         w2c, unexplained = _refined(rows, view, w2c, known if last else free, steps)
     chosen = _ahead(view, unexplained, 1, None)
     poses, cost = np.full((number, 3, 4), np.nan), np.full(number, np.inf)
@@ -270,19 +271,20 @@ def _unexplained(rows: Any, begin: int, count: int, pose: Any, seen: Any, tolera
     return total / weight
 
 
-def _consensus(views: Views) -> Float[np.ndarray, "m 3 4"]:
-    """Pose (w2c) of each view by OpenCV's RANSAC over three-point poses; the identity, far off, where it finds none.
+def _consensus(views: Views, chosen: Int[np.ndarray, "c"]) -> Float[np.ndarray, "c 3 4"]:
+    """Poses (w2c) of some views by OpenCV's RANSAC over three-point poses; the identity, far off, where it finds none.
 
     For the few views that nothing else could place: OpenCV takes one view at a time.
     """
     import cv2
 
-    found = np.tile(np.eye(3, 4), (len(views.uv), 1, 1))
-    cv2.setRNGSeed(0)
+    found = np.tile(np.eye(3, 4), (len(chosen), 1, 1))
     usable = (views.weight > 0) & np.isfinite(views.points).all(-1)[views.label]
-    for i, seen in enumerate(usable):
+    for n, i in enumerate(chosen.tolist()):
+        seen = usable[i]
         if int(seen.sum()) < _SAMPLE:
             continue
+        cv2.setRNGSeed(0)
         ok, turn, shift, _ = cv2.solvePnPRansac(
             views.points[views.label[i, seen]],
             views.uv[i, seen] / views.focal,
@@ -293,7 +295,7 @@ def _consensus(views: Views) -> Float[np.ndarray, "m 3 4"]:
             flags=cv2.SOLVEPNP_AP3P,
         )
         if ok:
-            found[i] = np.hstack([cv2.Rodrigues(turn)[0], shift])
+            found[n] = np.hstack([cv2.Rodrigues(turn)[0], shift])
     return found
 
 

@@ -173,17 +173,14 @@ def reduce_system(data: Measured, now: Estimate, work: System, damping: float, b
             diagonal[i] += dot(row, row, 2 * count)
         width += shared
         y = coupling(data, work, n)
+        m0, m1, m2, m3, m4, m5 = mixed[0], mixed[1], mixed[2], mixed[3], mixed[4], mixed[5]
         for p in range(6):
+            row, total = y[p], dot(w[p], right, 6)
+            w0, w1, w2, w3, w4, w5 = w[p, 0], w[p, 1], w[p, 2], w[p, 3], w[p, 4], w[p, 5]
             for i in range(width):
-                y[p, i] = 0.0
-            total = 0.0
-            for q in range(p + 1):
-                part = w[p, q]
-                total += part * right[q]
-                for i in range(width):
-                    y[p, i] += part * mixed[q, i]
+                row[i] = w0 * m0[i] + w1 * m1[i] + w2 * m2[i] + w3 * m3[i] + w4 * m4[i] + w5 * m5[i]
             for i in range(width):
-                rhs[columns[i]] += y[p, i] * total
+                rhs[columns[i]] += row[i] * total
             work.gradient[n, p] = total
         # two rows at a time share the loads; the last row of an odd width is computed twice
         for i in range(0, width, 2):

@@ -7,7 +7,6 @@ import pytest
 
 from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.geometry.rotations import skew, so3_log
-from kronc_ns.solve import covariance as module
 from kronc_ns.solve.covariance import camera_covariance
 from kronc_ns.solve.lm import LmConfig, adjust
 from kronc_ns.solve.problem import Problem, ShapePrior, State
@@ -58,11 +57,9 @@ def test_the_gauge_does_not_show_in_the_images():
     assert np.abs(matrix @ directions).max() < 1e-9 * np.abs(matrix).max() * np.abs(directions).max()
 
 
-@pytest.mark.parametrize("parts", [1, 2])
 @pytest.mark.parametrize("refine", [(), ("focal",), ("focal", "k1")])
 @pytest.mark.parametrize("variant", ["plain", "prior", "unseen"])
-def test_it_is_that_of_the_whole_system_with_the_points_held_still(variant, refine, parts, monkeypatch):
-    monkeypatch.setattr(module, "_MANY", 1 if parts == 2 else np.inf)
+def test_it_is_that_of_the_whole_system_with_the_points_held_still(variant, refine):
     problem, truth = scene(views=7, joints=12, seen=0.9, refine=refine)
     state, shape_weight = replace(truth, log_growth=0.05, k1=-0.03), 0.6
     if variant == "prior":
