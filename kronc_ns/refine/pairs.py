@@ -33,11 +33,11 @@ def view_angles(centre: Float[np.ndarray, "n 3"], middle: Float[np.ndarray, "3"]
     return np.degrees(np.arccos(np.clip(direction @ direction.T, -1.0, 1.0)))
 
 
-def choose_pairs(angles: Float[np.ndarray, "n n"]) -> Int[np.ndarray, "p 2"]:
-    """Pairs (i < j), each once, in order."""
+def choose_pairs(angles: Float[np.ndarray, "n n"], most: int = _NEAREST) -> Int[np.ndarray, "p 2"]:
+    """Pairs (i < j) of each view and its nearest, each once, in order."""
     within = _SPARSE_DEG if len(angles) <= _SPARSE else _WITHIN_DEG
     apart = np.where(np.eye(len(angles), dtype=bool), np.inf, angles)
-    nearest = np.argsort(apart, axis=1, kind="stable")[:, :_NEAREST]
+    nearest = np.argsort(apart, axis=1, kind="stable")[:, :most]
     view = np.broadcast_to(np.arange(len(angles))[:, None], nearest.shape)
     near = np.take_along_axis(apart, nearest, axis=1) <= within
     pairs = np.sort(np.stack([view[near], nearest[near]], axis=1), axis=1)

@@ -19,8 +19,18 @@ from kronc_ns.refine.placement import relocated
 from kronc_ns.refine.region import background_is_still, vehicle_features
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.search import Search, find_tracks, standing_features
-from kronc_ns.refine.tracks import HELD_SHARE, Tracks, confirmed, enough, of_held_views, place, without
-from kronc_ns.refine.verdict import Evidence, weigh
+from kronc_ns.refine.tracks import (
+    HELD_SHARE,
+    Tracks,
+    confirmed,
+    enough,
+    long_sightings,
+    of_held_views,
+    place,
+    without,
+)
+from kronc_ns.refine.unguided import unguided_tracks
+from kronc_ns.refine.verdict import HELD_BY, MOST_LOOSE, Evidence, weigh
 from kronc_ns.scene import Scene
 
 _HELD_OUT = 0.2  # share of the tracks that no fit sees
@@ -28,6 +38,7 @@ _TRACKS_OF_VIEW = 400  # that are enough, once their places are those of patches
 _PAIRED = 20  # sightings of a view in tracks of three, below which its tracks of two count
 _ROUNDS, _SETTLED_DEG, _SETTLED_SIGMAS = 6, 0.05, 8.0  # of matching by the poses of features, until these turn less on
 # average, or less than so many times the noise of a feature: then they only follow it
+_FIRST_NEAREST, _FIRST_SCALE_PX = 4, 10.0  # views that each is compared with at first; how far off points may be then
 _FOR_FOCAL = 50  # tracks of a view that are enough to see whether the focal length is right
 
 
@@ -87,12 +98,11 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
     """Poses from features; None where there are no tracks."""
     start, keypoints, gathered, search = prepared.start, prepared.keypoints, prepared.gathered, prepared.search
     rng = np.random.default_rng(config.seed)
-    tracks = find_tracks(gathered, search, start, keypoints, None)
+    tracks = _first(prepared)
     reserved = tracks.chosen(rng.random(len(tracks)) < _HELD_OUT)
     held = np.zeros(len(gathered.view), bool)
     held[reserved.feature] = True
-    fitted = confirmed(without(tracks, held), gathered.view, _PAIRED)
-    fitted = enough(fitted, gathered.view, _TRACKS_OF_VIEW, rng)
+    fitted = enough(without(tracks, held), gathered.view, _TRACKS_OF_VIEW, rng)
     if not len(fitted):
         return None
     latest = adjust(keypoints, fitted, gathered, start, None)
@@ -120,6 +130,17 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
         evidence = replace(evidence, focal_growth=freed.rig.focal / latest.rig.focal)
     final = adjust(believed, _placed(tracks, aligned, latest), aligned, latest.rig, config, latest.sigma_px)
     return Found(final, believed, evidence)
+
+
+def _first(prepared: Prepared) -> Tracks:
+    """Tracks that owe nothing to the keypoints' poses, where they hold the views together; else what these find."""
+    start, gathered, search = prepared.start, prepared.gathered, prepared.search
+    uv = start.ideal(gathered.pixel, gathered.view)
+    pairs = choose_pairs(_angles(start), _FIRST_NEAREST)
+    tracks = unguided_tracks(gathered, search.used, pairs, uv, start.focal, search.advance)
+    if (long_sightings(tracks, gathered.view, len(start.rotation)) >= HELD_BY).mean() >= 1 - MOST_LOOSE:
+        return place(tracks, uv, gathered.view, start.cameras, _FIRST_SCALE_PX)[0]
+    return confirmed(find_tracks(gathered, search, start, prepared.keypoints, None), gathered.view, _PAIRED)
 
 
 def _mended(latest: Adjusted, gathered: Gathered, search: Search) -> Adjusted:

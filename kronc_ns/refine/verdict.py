@@ -22,7 +22,7 @@ _MOST_KEYPOINTS_Z, _MOST_VIEW_SIGMAS, _MOST_BAD_VIEWS = 6.0, 5.0, 0.2
 """Of the rise of the keypoints' chi-square: of all; of one view; the share of views that may exceed that."""
 _LEAST_TRACKS, _LEAST_LONG = 10, 10
 """Held-out tracks that must be met, before or after; and how many of three views."""
-_HELD_BY, _MOST_LOOSE = 10, 0.25
+HELD_BY, MOST_LOOSE = 10, 0.25
 """Sightings in tracks of three views that hold a view; the share of views that may have fewer."""
 _MOST_FOCAL = 0.03
 """Growth of a focal length that is held fixed, past which all poses are bent to suit it."""
@@ -62,7 +62,7 @@ class Evidence:
                 f"too few features are seen from three views ({self.held_long} of the tracks held out, "
                 f"{_LEAST_LONG} are needed)"
             )
-        if self.loose_views > _MOST_LOOSE * self.views:
+        if self.loose_views > MOST_LOOSE * self.views:
             return f"features hold only {self.views - self.loose_views} of {self.views} views together"
         if not self.held_z > _LEAST_Z:
             return (
@@ -111,7 +111,7 @@ def weigh(
         keypoints_z=float((others - expected).sum() / (spread * math.sqrt(max(len(others), 1)))),
         bad_views=int(bad.sum()),
         views=len(after.rotation),
-        loose_views=int((seen < _HELD_BY).sum()),
+        loose_views=int((seen < HELD_BY).sum()),
     )
 
 
