@@ -29,7 +29,7 @@ REDUNDANCY_MOST = 1.6
 
 CAUCHY, TRIMMED, HUBER, SQUARES = 0, 1, 2, 3
 """Phases: the graduated Cauchy loss, trimmed squares after it; Huber's loss, or squares, throughout."""
-COARSE = 5e-2
+COARSE = 1e-2
 """Tolerance of the graduated phase: the share of the cost that the next step may still gain."""
 LOOSE = 0.7
 """A scale that lags behind the residuals by more than this goes on with the graduated phase."""
