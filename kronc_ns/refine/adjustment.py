@@ -17,9 +17,10 @@ from kronc_ns.solve.robust import RAYLEIGH_MEDIAN
 from kronc_ns.solve.sightings import Sightings, Unknowns
 
 _FIRST_SIGMA_PX, _LEAST_SIGMA_PX = 0.5, 0.02  # of a feature's place
+_NO_OUTLIERS, _NARROWING = 0.95, 4.0  # of the features, where the loss begins; of the loss, from round to round
 _PAIR_FACTOR = 1.5  # tracks of two views, which nothing confirms, are believed less
 _ASKEW_DEG = 8.0  # from the middle of the views of a point, where a patch seen askew has doubled its variance
-_ROUNDS, _SETTLED = 4, 0.93  # of the noise's estimate
+_ROUNDS, _SETTLED = 6, 0.93  # of the noise's estimate
 _STEPS, _TOLERANCE = 6, 1e-3
 _SETTLING_STEPS, _SETTLING_TOLERANCE = 15, 1e-5
 _LAST_STEPS, _LAST_TOLERANCE = 40, 1e-7  # slow bends of the whole ring are the last to settle
@@ -56,19 +57,23 @@ def adjust(
     """
     data, now = sightings(keypoints, tracks, gathered, rig, 1.0, refine)
     own = slice(int(keypoints.first[-1]), None)
-    before = float(np.median(bundle.error_px(data, now)[own]))
+    error = bundle.error_px(data, now)[own]
+    before = float(np.median(error))
     rounds = 0 if sigma_px is not None else _ROUNDS
     sigma = max(_FIRST_SIGMA_PX, before / RAYLEIGH_MEDIAN) if sigma_px is None else sigma_px
     redundancy = max(_LEAST_REDUNDANCY, 1 - 3 * len(tracks) / (2 * len(tracks.feature)))
+    # views that stand wrong have the largest errors, and their features are right: the loss narrows slowly around them
+    wide = max(1.0, float(np.quantile(error, _NO_OUTLIERS)) / RAYLEIGH_MEDIAN / sigma)
     for _ in range(rounds):
-        data = _with_noise(data, tracks, own, gathered, rig, sigma)
+        data = _with_noise(data, tracks, own, gathered, rig, sigma, wide)
         now = bundle.adjust(data, now, _STEPS, _TOLERANCE).now
         median = float(np.median(bundle.error_px(data, now)[own]))
         found = max(_LEAST_SIGMA_PX, median / RAYLEIGH_MEDIAN / math.sqrt(redundancy))
-        settled = found > _SETTLED * sigma
-        sigma = min(sigma, found)
-        if settled:
+        if found > _SETTLED * sigma and wide == 1.0:
+            sigma = min(sigma, found)
             break
+        scale, sigma = sigma * wide, min(sigma, found)
+        wide = max(1.0, scale / sigma / _NARROWING)
     data = _with_noise(data, tracks, own, gathered, rig, sigma)
     last = (_LAST_STEPS, _LAST_TOLERANCE) if sigma_px is not None else (_SETTLING_STEPS, _SETTLING_TOLERANCE)
     now = bundle.adjust(data, now, *last).now
@@ -131,10 +136,10 @@ def _noise(tracks: Tracks, gathered: Gathered, rig: Rig, sigma_px: float) -> Flo
 
 
 def _with_noise(
-    data: Sightings, tracks: Tracks, own: slice, gathered: Gathered, rig: Rig, sigma_px: float
+    data: Sightings, tracks: Tracks, own: slice, gathered: Gathered, rig: Rig, sigma_px: float, wide: float = 1.0
 ) -> Sightings:
-    """With another noise of the features."""
+    """With another noise of the features; the loss is so many times wider."""
     noise = _noise(tracks, gathered, rig, sigma_px)
     weight, scale = data.weight.copy(), data.scale.copy()
-    weight[own], scale[own] = noise**-2.0, noise
+    weight[own], scale[own] = noise**-2.0, wide * noise
     return data._replace(weight=weight, scale=scale)

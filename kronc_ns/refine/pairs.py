@@ -44,6 +44,13 @@ def choose_pairs(angles: Float[np.ndarray, "n n"], most: int = _NEAREST) -> Int[
     return np.unique(pairs, axis=0)
 
 
+def with_next(pairs: Int[np.ndarray, "p 2"], views: int) -> Int[np.ndarray, "q 2"]:
+    """With the pairs of photos taken one after the other, which are neighbours wherever poses have them."""
+    first = np.arange(views)
+    following = np.sort(np.stack([first, (first + 1) % views], axis=1), axis=1)
+    return np.unique(np.concatenate([pairs, following[following[:, 0] < following[:, 1]]]), axis=0)
+
+
 def joint_covariance(data: Sightings, now: Unknowns, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "f f"]:
     """Of all reduced unknowns together, in some gauge; views that nothing is known of get what can be believed.
 

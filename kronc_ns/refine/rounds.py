@@ -12,7 +12,7 @@ from kronc_ns.refine.counter import Counter
 from kronc_ns.refine.gathering import Gathered, gather
 from kronc_ns.refine.keypoints import KeypointTracks, alike
 from kronc_ns.refine.options import RefineConfig
-from kronc_ns.refine.pairs import choose_pairs, view_angles
+from kronc_ns.refine.pairs import choose_pairs, view_angles, with_next
 from kronc_ns.refine.patches import align, grow
 from kronc_ns.refine.pictures import Pictures
 from kronc_ns.refine.placement import relocated
@@ -136,7 +136,7 @@ def _first(prepared: Prepared) -> Tracks:
     """Tracks that owe nothing to the keypoints' poses, where they hold the views together; else what these find."""
     start, gathered, search = prepared.start, prepared.gathered, prepared.search
     uv = start.ideal(gathered.pixel, gathered.view)
-    pairs = choose_pairs(_angles(start), _FIRST_NEAREST)
+    pairs = with_next(choose_pairs(_angles(start), _FIRST_NEAREST), len(start.rotation))
     tracks = unguided_tracks(gathered, search.used, pairs, uv, start.focal, search.advance)
     if (long_sightings(tracks, gathered.view, len(start.rotation)) >= HELD_BY).mean() >= 1 - MOST_LOOSE:
         return place(tracks, uv, gathered.view, start.cameras, _FIRST_SCALE_PX)[0]

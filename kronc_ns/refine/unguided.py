@@ -1,7 +1,7 @@
 """Tracks that need no poses: features of neighbouring views that choose each other, where one epipolar geometry fits.
 
 Keypoints of few photos are off by more than guided matching looks from them, and what it finds near wrong lines
-confirms them. Only the matches are used, not the geometry that they were found by: of a few, or of a plane, it is vague.
+confirms them. Only the matches are used, not the geometry they were found by: of few, or of a plane, it is vague.
 """
 
 from collections.abc import Callable
@@ -106,9 +106,7 @@ def _agree(
     nobody = np.zeros(len(here), bool)
     if len(here) < _LEAST:
         return nobody
-    _, inlier = cv2.findEssentialMat(
-        here, there, camera, cv2.USAC_MAGSAC, _CONFIDENCE, _WITHIN_PX, maxIters=_TRIALS
-    )
+    _, inlier = cv2.findEssentialMat(here, there, camera, cv2.USAC_MAGSAC, _CONFIDENCE, _WITHIN_PX, maxIters=_TRIALS)
     if inlier is None:
         return nobody
     agree = inlier[:, 0] > 0
