@@ -81,7 +81,7 @@ def prepare(
     """Find features in the photos of some views, whose cameras are ``start``, and say which are used."""
     angles = _angles(start)
     pairs = choose_pairs(angles)
-    counter.expect(len(views) + 2 * len(pairs))
+    counter.expect(len(views) + len(pairs))
     cameras = [scene.camera_of(view) for view in views.tolist()]
     gathered = gather(pictures, views, cameras, start.rotation[:, :, 2], angles, counter.advance)
     uv = start.ideal(gathered.pixel, gathered.view)
@@ -98,7 +98,7 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
     """Poses from features; None where there are no tracks."""
     start, keypoints, gathered, search = prepared.start, prepared.keypoints, prepared.gathered, prepared.search
     rng = np.random.default_rng(config.seed)
-    tracks = _first(prepared)
+    tracks = _first(prepared, counter)
     reserved = tracks.chosen(rng.random(len(tracks)) < _HELD_OUT)
     held = np.zeros(len(gathered.view), bool)
     held[reserved.feature] = True
@@ -132,14 +132,16 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
     return Found(final, believed, evidence)
 
 
-def _first(prepared: Prepared) -> Tracks:
+def _first(prepared: Prepared, counter: Counter) -> Tracks:
     """Tracks that owe nothing to the keypoints' poses, where they hold the views together; else what these find."""
     start, gathered, search = prepared.start, prepared.gathered, prepared.search
     uv = start.ideal(gathered.pixel, gathered.view)
     pairs = with_next(choose_pairs(_angles(start), _FIRST_NEAREST), len(start.rotation))
+    counter.expect(len(pairs))
     tracks = unguided_tracks(gathered, search.used, pairs, uv, start.focal, search.advance)
     if (long_sightings(tracks, gathered.view, len(start.rotation)) >= HELD_BY).mean() >= 1 - MOST_LOOSE:
         return place(tracks, uv, gathered.view, start.cameras, _FIRST_SCALE_PX)[0]
+    counter.expect(len(search.pairs))
     return confirmed(find_tracks(gathered, search, start, prepared.keypoints, None), gathered.view, _PAIRED)
 
 
