@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.refine.gathering import Gathered
@@ -17,7 +17,7 @@ from kronc_ns.solve.robust import RAYLEIGH_MEDIAN
 from kronc_ns.solve.sightings import Sightings, Unknowns
 
 _FIRST_SIGMA_PX, _LEAST_SIGMA_PX = 0.5, 0.02  # of a feature's place
-_NO_OUTLIERS, _NARROWING = 0.95, 4.0  # of the features, where the loss begins; of the loss, from round to round
+_NARROWING = 4.0  # of the loss, from round to round
 _PAIR_FACTOR = 1.5  # tracks of two views, which nothing confirms, are believed less
 _ASKEW_DEG = 8.0  # from the middle of the views of a point, where a patch seen askew has doubled its variance
 _ROUNDS, _SETTLED = 6, 0.93  # of the noise's estimate
@@ -62,8 +62,9 @@ def adjust(
     rounds = 0 if sigma_px is not None else _ROUNDS
     sigma = max(_FIRST_SIGMA_PX, before / RAYLEIGH_MEDIAN) if sigma_px is None else sigma_px
     redundancy = max(_LEAST_REDUNDANCY, 1 - 3 * len(tracks) / (2 * len(tracks.feature)))
-    # views that stand wrong have the largest errors, and their features are right: the loss narrows slowly around them
-    wide = max(1.0, float(np.quantile(error, _NO_OUTLIERS)) / RAYLEIGH_MEDIAN / sigma)
+    # a view that stands wrong has large errors, and its features are right: the loss narrows slowly around them
+    worst = _worst_median(error, gathered.view[tracks.feature])
+    wide = max(1.0, worst / RAYLEIGH_MEDIAN / sigma)
     for _ in range(rounds):
         data = _with_noise(data, tracks, own, gathered, rig, sigma, wide)
         now = bundle.adjust(data, now, _STEPS, _TOLERANCE).now
@@ -87,6 +88,14 @@ def adjust(
     found_rig = found_rig.with_lenses(*now.intrinsics.T).moved(back)
     points = back.apply(now.points[joints:])
     return Adjusted(found_rig, replace(tracks, points=points), gathered, sigma, before, after)
+
+
+def _worst_median(error: Float[np.ndarray, "s"], view: Int[np.ndarray, "s"]) -> float:
+    """The largest of the views' (lower) median errors."""
+    order = np.lexsort((error, view))
+    first = np.flatnonzero(np.diff(view[order], prepend=-1))
+    middle = first + (np.diff(first, append=len(order)) - 1) // 2
+    return float(error[order[middle]].max(initial=0.0))
 
 
 def sightings(
