@@ -4,20 +4,19 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from kronc_ns.geometry.alignment import umeyama
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.keypoints import KeypointTracks
 from kronc_ns.refine.options import RefineConfig
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import Tracks, angles_off_middle_deg
+from kronc_ns.refine.tracks import Tracks, angles_off_middle_deg, view_medians
 from kronc_ns.solve import bundle
 from kronc_ns.solve.robust import RAYLEIGH_MEDIAN
 from kronc_ns.solve.sightings import Sightings, Unknowns
 
 _FIRST_SIGMA_PX, _LEAST_SIGMA_PX = 0.5, 0.02  # of a feature's place
-_NARROWING = 4.0  # of the loss, from round to round
 _PAIR_FACTOR = 1.5  # tracks of two views, which nothing confirms, are believed less
 _ASKEW_DEG = 8.0  # from the middle of the views of a point, where a patch seen askew has doubled its variance
 _ROUNDS, _SETTLED = 6, 0.93  # of the noise's estimate
@@ -62,19 +61,21 @@ def adjust(
     rounds = 0 if sigma_px is not None else _ROUNDS
     sigma = max(_FIRST_SIGMA_PX, before / RAYLEIGH_MEDIAN) if sigma_px is None else sigma_px
     redundancy = max(_LEAST_REDUNDANCY, 1 - 3 * len(tracks) / (2 * len(tracks.feature)))
-    # a view that stands wrong has large errors, and its features are right: the loss narrows slowly around them
-    worst = _worst_median(error, gathered.view[tracks.feature])
-    wide = max(1.0, worst / RAYLEIGH_MEDIAN / sigma)
+    # a view that stands wrong has large errors, and its features are right: the loss is as wide as they are, as long as
+    # they fall
+    worst = float(view_medians(tracks, error, gathered.view, len(rig.rotation)).max())
     for _ in range(rounds):
+        wide = max(1.0, worst / RAYLEIGH_MEDIAN / sigma)
         data = _with_noise(data, tracks, own, gathered, rig, sigma, wide)
         now = bundle.adjust(data, now, _STEPS, _TOLERANCE).now
-        median = float(np.median(bundle.error_px(data, now)[own]))
-        found = max(_LEAST_SIGMA_PX, median / RAYLEIGH_MEDIAN / math.sqrt(redundancy))
-        if found > _SETTLED * sigma and wide == 1.0:
-            sigma = min(sigma, found)
+        error = bundle.error_px(data, now)[own]
+        found = max(_LEAST_SIGMA_PX, float(np.median(error)) / RAYLEIGH_MEDIAN / math.sqrt(redundancy))
+        settled = found > _SETTLED * sigma and wide == 1.0
+        sigma = min(sigma, found)
+        if settled:
             break
-        scale, sigma = sigma * wide, min(sigma, found)
-        wide = max(1.0, scale / sigma / _NARROWING)
+        falls = float(view_medians(tracks, error, gathered.view, len(rig.rotation)).max())
+        worst = falls if falls < worst / 2 else 0.0
     data = _with_noise(data, tracks, own, gathered, rig, sigma)
     last = (_LAST_STEPS, _LAST_TOLERANCE) if sigma_px is not None else (_SETTLING_STEPS, _SETTLING_TOLERANCE)
     now = bundle.adjust(data, now, *last).now
@@ -88,14 +89,6 @@ def adjust(
     found_rig = found_rig.with_lenses(*now.intrinsics.T).moved(back)
     points = back.apply(now.points[joints:])
     return Adjusted(found_rig, replace(tracks, points=points), gathered, sigma, before, after)
-
-
-def _worst_median(error: Float[np.ndarray, "s"], view: Int[np.ndarray, "s"]) -> float:
-    """The largest of the views' (lower) median errors."""
-    order = np.lexsort((error, view))
-    first = np.flatnonzero(np.diff(view[order], prepend=-1))
-    middle = first + (np.diff(first, append=len(order)) - 1) // 2
-    return float(error[order[middle]].max(initial=0.0))
 
 
 def sightings(

@@ -14,11 +14,12 @@ from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.pairs import view_angles
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import loose_views, without
+from kronc_ns.refine.tracks import loose_views, place, rows_of, view_medians, without
 
 _LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewhere
 _ACROSS_DEG, _RUN = 90.0, 0.25  # of views on the other side of the car than those before and after
 _RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricter
+_ASTRAY = 0.02  # of the focal length: median error of a view that no adjustment brought right
 _LEAST_OTHERS = 2  # views that a point must be seen in besides
 _TRIALS, _CONFIDENCE, _AGREES_PX = 3000, 0.9999, 4.0  # of RANSAC
 _CLOSER_PX = (4.0, 4.0, 2.0, 2.0)  # of matches that the pose is then fitted to, in turns
@@ -49,23 +50,45 @@ def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"
     return replace(rig, rotation=rotation, translation=translation)
 
 
+def reseated(adjusted: Adjusted) -> Rig:
+    """The cameras; those that their own tracks contradict as these see the points of the others.
+
+    Of tracks that owe nothing to the poses, which no adjustment could bring right.
+    """
+    rig, tracks, gathered = adjusted.rig, adjusted.tracks, adjusted.gathered
+    view, uv = gathered.view[tracks.feature], rig.ideal(gathered.pixel, gathered.view)
+    cameras, count = rig.cameras, len(rig.rotation)
+    error = place(tracks, uv, gathered.view, cameras, _AGREES_PX)[1]
+    rotation, translation = rig.rotation.copy(), rig.translation.copy()
+    for astray in np.flatnonzero(view_medians(tracks, error, gathered.view, count) > _ASTRAY * rig.focal).tolist():
+        own = view == astray
+        others = rows_of(tracks.feature[~own], tracks.of_track[~own], tracks.points)
+        known = np.isin(np.arange(len(tracks)), tracks.of_track[~own])
+        points = np.full((len(tracks), 3), np.nan)
+        points[known] = place(others, uv, gathered.view, cameras, _AGREES_PX)[0].points
+        seen = own & (np.bincount(tracks.of_track[~own], minlength=len(tracks)) >= _LEAST_OTHERS)[tracks.of_track]
+        found = _pose(points[tracks.of_track[seen]], uv[tracks.feature[seen]], rig.focal)
+        if found is not None:
+            rotation[astray], translation[astray] = found
+    return replace(rig, rotation=rotation, translation=translation)
+
+
 def across(angles: Float[np.ndarray, "n n"]) -> Int[np.ndarray, "n"]:
     """Runs of views, numbered from 1 on (0: of none), that are seen from across the car while those before and after
-    them in the order of the photos are not: front and rear, taken for each other. The first and the last view have
-    nobody on one side, and are of none.
+    them in the order of the photos are not: front and rear, taken for each other. Where the walk is a lap the first
+    photo follows the last; where it is not, these are not near each other, and neither is of a run.
 
     ``angles`` are degrees between the directions from which views see the car.
     """
     count = len(angles)
-    run = np.zeros(count, np.int64)
+    run, first = np.zeros(count, np.int64), np.arange(count)
     for length in range(1, int(_RUN * count) + 1):
-        first = np.arange(1, count - length)
-        before, after = first - 1, first + length
-        inside = first[:, None] + np.arange(length)
+        before, after = first - 1, (first + length) % count
+        inside = (first[:, None] + np.arange(length)) % count
         far = np.minimum(angles[before[:, None], inside], angles[after[:, None], inside]) > _ACROSS_DEG
-        for begin in first[(angles[before, after] < _ACROSS_DEG) & far.all(1)].tolist():
-            if not run[begin : begin + length].any():
-                run[begin : begin + length] = run.max() + 1
+        for own in inside[(angles[before, after] < _ACROSS_DEG) & far.all(1)]:
+            if not run[own].any():
+                run[own] = run.max() + 1
     return run
 
 

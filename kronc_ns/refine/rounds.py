@@ -15,7 +15,7 @@ from kronc_ns.refine.options import RefineConfig
 from kronc_ns.refine.pairs import choose_pairs, view_angles, with_next
 from kronc_ns.refine.patches import align, grow
 from kronc_ns.refine.pictures import Pictures
-from kronc_ns.refine.placement import relocated
+from kronc_ns.refine.placement import relocated, reseated
 from kronc_ns.refine.region import background_is_still, vehicle_features
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.search import Search, find_tracks, standing_features
@@ -106,6 +106,9 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
     if not len(fitted):
         return None
     latest = adjust(keypoints, fitted, gathered, start, None)
+    seated = reseated(latest)
+    if (seated.rotation != latest.rig.rotation).any():
+        latest = adjust(keypoints, fitted, gathered, seated, None)
     planned = len(search.pairs)
     for _ in range(_ROUNDS):
         earlier = latest.rig

@@ -126,6 +126,23 @@ def long_sightings(tracks: Tracks, view: Int[np.ndarray, "f"], views: int) -> In
     return np.bincount(view[tracks.feature[(tracks.lengths >= 3)[tracks.of_track]]], minlength=views)
 
 
+def view_medians(
+    tracks: Tracks, error: Float[np.ndarray, "s"], view: Int[np.ndarray, "f"], views: int
+) -> Float[np.ndarray, "n"]:
+    """The (lower) median error of each view's sightings in tracks of three views or more; 0 where it has none.
+
+    A point that two views see lies where their rays pass each other, wherever they stand.
+    """
+    long = (tracks.lengths >= 3)[tracks.of_track]
+    error, view = error[long], view[tracks.feature[long]]
+    order = np.lexsort((error, view))
+    first = np.flatnonzero(np.diff(view[order], prepend=-1))
+    middle = first + (np.diff(first, append=len(order)) - 1) // 2
+    medians = np.zeros(views)
+    medians[view[order[first]]] = error[order[middle]]
+    return medians
+
+
 def confirmed(tracks: Tracks, view: Int[np.ndarray, "f"], least: int) -> Tracks:
     """Those of three views; and of two, until every view has ``least``, where it has fewer of three.
 
