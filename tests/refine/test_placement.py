@@ -14,11 +14,11 @@ from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.keypoints import MOST_ALIKE, KeypointTracks, alike
 from kronc_ns.refine.pipeline import refine_scene
-from kronc_ns.refine.placement import across, placed, relocated
+from kronc_ns.refine.placement import across, placed, relocated, reseated
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.rounds import _mended
 from kronc_ns.refine.search import Search, find_tracks
-from kronc_ns.refine.tracks import Linked, of_held_views, rows_of
+from kronc_ns.refine.tracks import Linked, of_held_views, rows_of, view_medians
 from kronc_ns.solution import ViewStatus
 
 CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
@@ -115,6 +115,36 @@ def test_views_that_lie_right_or_have_features_enough_stay():
     np.testing.assert_array_equal(left.rotation, well_seen.rotation)
 
 
+@pytest.mark.parametrize("deg", [40.0, 178.0])
+def test_views_that_their_own_tracks_contradict_are_seated_by_them(deg):
+    """Of tracks that owe nothing to the poses; others stay where they are."""
+    rig, gathered, tracks = made(np.random.default_rng(0), hidden_from=7)
+    wrong = turned(turned(rig, 2, deg), 5, deg)
+    found = reseated(Adjusted(wrong, tracks, gathered, 0.2, 1.0, 0.2))
+    off = rotation_angle_deg(found.rotation @ rig.rotation.transpose(0, 2, 1))
+    assert off[[2, 5]].max() < 0.1
+    assert np.linalg.norm(found.cameras.centre - rig.cameras.centre, axis=1).max() < 0.01
+    rest = [0, 1, 3, 4, 6, 7]
+    np.testing.assert_array_equal(found.rotation[rest], rig.rotation[rest])
+
+
+def test_tracks_that_nothing_explains_seat_nobody():
+    rng = np.random.default_rng(1)
+    rig, gathered, tracks = made(rng, hidden_from=7)
+    gathered.pixel[gathered.first[5] : gathered.first[6]] = rng.uniform(0, 480, (110, 2))
+    found = reseated(Adjusted(rig, tracks, gathered, 0.2, 1.0, 0.2))
+    np.testing.assert_array_equal(found.rotation, rig.rotation)
+
+
+def test_medians_are_those_of_sightings_that_others_confirm():
+    tracks = rows_of(np.arange(10), np.array([0, 0, 0, 1, 1, 1, 1, 2, 2, 2]), np.zeros((3, 3)))
+    view = np.array([0, 1, 2, 0, 1, 2, 3, 0, 1, 2])
+    error = np.array([1.0, 5.0, 0.1, 3.0, 6.0, 0.2, 9.0, 2.0, 4.0, 0.3])
+    np.testing.assert_array_equal(view_medians(tracks, error, view, 5), [2.0, 5.0, 0.2, 9.0, 0.0])
+    pair = rows_of(np.arange(2), np.zeros(2, int), np.zeros((1, 3)))
+    assert not view_medians(pair, np.ones(2), view, 5).any()
+
+
 def test_features_that_may_not_be_used_place_nothing():
     rig, gathered, tracks = made(np.random.default_rng(2))
     wrong = turned(rig, 5, 178.0)
@@ -180,6 +210,12 @@ def test_runs_across_the_car_are_told_from_laps_and_from_jumps():
     turned = lap.copy()
     turned[[2, 7, 8]] += 180
     assert across(between(turned)).tolist() == [0, 0, 1, 0, 0, 0, 0, 2, 2, 0, 0, 0]
+    ends = 24.0 * np.arange(15)  # a whole lap: the first follows the last
+    ends[[0, 14]] += 180
+    assert across(between(ends)).tolist() == [1] + 13 * [0] + [1]
+    half = 15.0 * np.arange(12)
+    half[0] += 180
+    assert not across(between(half)).any()
     turned[3:8] = lap[3:8] + 180
     assert not across(between(turned))[3:8].any()  # too many of them to be the wrong ones
 
