@@ -14,7 +14,7 @@ from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.pairs import view_angles
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import loose_views, place, rows_of, view_medians, without
+from kronc_ns.refine.tracks import Tracks, loose_views, place, view_medians, without, without_views
 
 _LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewhere
 _ACROSS_DEG, _RUN = 90.0, 0.25  # of views on the other side of the car than those before and after
@@ -50,27 +50,30 @@ def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"
     return replace(rig, rotation=rotation, translation=translation)
 
 
-def reseated(adjusted: Adjusted) -> Rig:
-    """The cameras; those that their own tracks contradict as these see the points of the others.
+def seated(adjusted: Adjusted, tracks: Tracks, astray: Bool[np.ndarray, "n"]) -> tuple[Rig, Bool[np.ndarray, "n"]]:
+    """The cameras, those that are ``astray`` or that no adjustment brought right where they see the points of all
+    others; and which of them found a place so.
 
-    Of tracks that owe nothing to the poses, which no adjustment could bring right.
+    By ``tracks`` that owe nothing to the poses, those of these views among them.
     """
-    rig, tracks, gathered = adjusted.rig, adjusted.tracks, adjusted.gathered
-    view, uv = gathered.view[tracks.feature], rig.ideal(gathered.pixel, gathered.view)
-    cameras, count = rig.cameras, len(rig.rotation)
-    error = place(tracks, uv, gathered.view, cameras, _AGREES_PX)[1]
-    rotation, translation = rig.rotation.copy(), rig.translation.copy()
-    for astray in np.flatnonzero(view_medians(tracks, error, gathered.view, count) > _ASTRAY * rig.focal).tolist():
-        own = view == astray
-        others = rows_of(tracks.feature[~own], tracks.of_track[~own], tracks.points)
-        known = np.isin(np.arange(len(tracks)), tracks.of_track[~own])
-        points = np.full((len(tracks), 3), np.nan)
-        points[known] = place(others, uv, gathered.view, cameras, _AGREES_PX)[0].points
-        seen = own & (np.bincount(tracks.of_track[~own], minlength=len(tracks)) >= _LEAST_OTHERS)[tracks.of_track]
-        found = _pose(points[tracks.of_track[seen]], uv[tracks.feature[seen]], rig.focal)
-        if found is not None:
-            rotation[astray], translation[astray] = found
-    return replace(rig, rotation=rotation, translation=translation)
+    rig, gathered = adjusted.rig, adjusted.gathered
+    count, uv = len(rig.rotation), rig.ideal(gathered.pixel, gathered.view)
+    error = place(adjusted.tracks, uv, gathered.view, rig.cameras, _AGREES_PX)[1]
+    medians = view_medians(adjusted.tracks, error, gathered.view, count)
+    asked = astray | (medians > _ASTRAY * rig.focal)
+    believed = without_views(tracks, gathered.view, asked, _LEAST_OTHERS)
+    points = place(believed, uv, gathered.view, rig.cameras, _AGREES_PX)[0].points
+    others = ~asked[gathered.view[tracks.feature]]
+    known = np.bincount(tracks.of_track[others], minlength=len(tracks)) >= _LEAST_OTHERS
+    row = np.cumsum(known) - 1  # of a track among those that are believed
+    rotation, translation, found = rig.rotation.copy(), rig.translation.copy(), np.zeros(count, bool)
+    for view in np.flatnonzero(asked).tolist():
+        own = (gathered.view[tracks.feature] == view) & known[tracks.of_track]
+        pose = _pose(points[row[tracks.of_track[own]]], uv[tracks.feature[own]], rig.focal)
+        if pose is not None:
+            rotation[view], translation[view] = pose
+            found[view] = True
+    return replace(rig, rotation=rotation, translation=translation), found
 
 
 def across(angles: Float[np.ndarray, "n n"]) -> Int[np.ndarray, "n"]:

@@ -15,7 +15,7 @@ from kronc_ns.refine.options import RefineConfig
 from kronc_ns.refine.pairs import choose_pairs, view_angles, with_next
 from kronc_ns.refine.patches import align, grow
 from kronc_ns.refine.pictures import Pictures
-from kronc_ns.refine.placement import relocated, reseated
+from kronc_ns.refine.placement import across, relocated, seated
 from kronc_ns.refine.region import background_is_still, vehicle_features
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.search import Search, find_tracks, standing_features
@@ -28,6 +28,7 @@ from kronc_ns.refine.tracks import (
     of_held_views,
     place,
     without,
+    without_views,
 )
 from kronc_ns.refine.unguided import unguided_tracks
 from kronc_ns.refine.verdict import HELD_BY, MOST_LOOSE, Evidence, weigh
@@ -105,10 +106,7 @@ def find_poses(prepared: Prepared, config: RefineConfig, counter: Counter) -> Fo
     fitted = enough(without(tracks, held), gathered.view, _TRACKS_OF_VIEW, rng)
     if not len(fitted):
         return None
-    latest = adjust(keypoints, fitted, gathered, start, None)
-    seated = reseated(latest)
-    if (seated.rotation != latest.rig.rotation).any():
-        latest = adjust(keypoints, fitted, gathered, seated, None)
+    latest = _begun(prepared, fitted)
     planned = len(search.pairs)
     for _ in range(_ROUNDS):
         earlier = latest.rig
@@ -146,6 +144,18 @@ def _first(prepared: Prepared, counter: Counter) -> Tracks:
         return place(tracks, uv, gathered.view, start.cameras, _FIRST_SCALE_PX)[0]
     counter.expect(len(search.pairs))
     return confirmed(find_tracks(gathered, search, start, prepared.keypoints, None), gathered.view, _PAIRED)
+
+
+def _begun(prepared: Prepared, tracks: Tracks) -> Adjusted:
+    """Cameras that fit the first tracks. Those that stand across the car from the photos before and after them would
+    drag these along: they join where they see the points of the others."""
+    start, keypoints, gathered = prepared.start, prepared.keypoints, prepared.gathered
+    astray = across(_angles(start)) > 0
+    begun = adjust(keypoints, without_views(tracks, gathered.view, astray), gathered, start, None)
+    rig, found = seated(begun, tracks, astray)
+    if not found.any():
+        return begun
+    return adjust(keypoints, without_views(tracks, gathered.view, astray & ~found), gathered, rig, None)
 
 
 def _mended(latest: Adjusted, gathered: Gathered, search: Search) -> Adjusted:

@@ -170,9 +170,14 @@ def without(tracks: Tracks, held: Bool[np.ndarray, "f"]) -> Tracks:
 
 def of_held_views(tracks: Tracks, view: Int[np.ndarray, "f"], share: float) -> Tracks:
     """The tracks less the sightings of `loose_views`."""
-    keep = ~loose_views(tracks, view, int(view.max(initial=0)) + 1, share)[view[tracks.feature]]
+    return without_views(tracks, view, loose_views(tracks, view, int(view.max(initial=0)) + 1, share))
+
+
+def without_views(tracks: Tracks, view: Int[np.ndarray, "f"], out: Bool[np.ndarray, "n"], least: int = 2) -> Tracks:
+    """The tracks less the sightings of some views, where as many as ``least`` are left."""
+    keep = ~out[view[tracks.feature]]
     left = rows_of(tracks.feature[keep], tracks.of_track[keep], tracks.points)
-    return left.chosen(left.lengths >= 2)
+    return left.chosen(left.lengths >= least)
 
 
 def place(

@@ -14,11 +14,11 @@ from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.keypoints import MOST_ALIKE, KeypointTracks, alike
 from kronc_ns.refine.pipeline import refine_scene
-from kronc_ns.refine.placement import across, placed, relocated, reseated
+from kronc_ns.refine.placement import across, placed, relocated, seated
 from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.rounds import _mended
 from kronc_ns.refine.search import Search, find_tracks
-from kronc_ns.refine.tracks import Linked, of_held_views, rows_of, view_medians
+from kronc_ns.refine.tracks import Linked, of_held_views, rows_of, view_medians, without_views
 from kronc_ns.solution import ViewStatus
 
 CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
@@ -115,12 +115,16 @@ def test_views_that_lie_right_or_have_features_enough_stay():
     np.testing.assert_array_equal(left.rotation, well_seen.rotation)
 
 
+@pytest.mark.parametrize("told", [True, False])
 @pytest.mark.parametrize("deg", [40.0, 178.0])
-def test_views_that_their_own_tracks_contradict_are_seated_by_them(deg):
+def test_views_that_stand_astray_are_seated_by_their_own_tracks(deg, told):
     """Of tracks that owe nothing to the poses; others stay where they are."""
     rig, gathered, tracks = made(np.random.default_rng(0), hidden_from=7)
     wrong = turned(turned(rig, 2, deg), 5, deg)
-    found = reseated(Adjusted(wrong, tracks, gathered, 0.2, 1.0, 0.2))
+    astray = np.isin(np.arange(8), [2, 5]) & told
+    used_so_far = without_views(tracks, gathered.view, astray)
+    found, which = seated(Adjusted(wrong, used_so_far, gathered, 0.2, 1.0, 0.2), tracks, astray)
+    assert np.flatnonzero(which).tolist() == [2, 5]
     off = rotation_angle_deg(found.rotation @ rig.rotation.transpose(0, 2, 1))
     assert off[[2, 5]].max() < 0.1
     assert np.linalg.norm(found.cameras.centre - rig.cameras.centre, axis=1).max() < 0.01
@@ -132,8 +136,19 @@ def test_tracks_that_nothing_explains_seat_nobody():
     rng = np.random.default_rng(1)
     rig, gathered, tracks = made(rng, hidden_from=7)
     gathered.pixel[gathered.first[5] : gathered.first[6]] = rng.uniform(0, 480, (110, 2))
-    found = reseated(Adjusted(rig, tracks, gathered, 0.2, 1.0, 0.2))
+    found, which = seated(Adjusted(rig, tracks, gathered, 0.2, 1.0, 0.2), tracks, np.zeros(8, bool))
+    assert not which.any()
     np.testing.assert_array_equal(found.rotation, rig.rotation)
+
+
+def test_a_view_may_be_left_out_of_tracks():
+    tracks = rows_of(np.arange(9), np.array([0, 0, 0, 1, 1, 2, 2, 2, 2]), np.arange(9.0).reshape(3, 3))
+    view = np.array([0, 1, 2, 0, 1, 0, 1, 2, 3])
+    left = without_views(tracks, view, np.array([False, True, False, False]))
+    assert left.feature.tolist() == [0, 2, 5, 7, 8]
+    assert left.of_track.tolist() == [0, 0, 1, 1, 1]
+    np.testing.assert_array_equal(left.points, tracks.points[[0, 2]])
+    assert without_views(tracks, view, np.zeros(4, bool), 4).feature.tolist() == [5, 6, 7, 8]
 
 
 def test_medians_are_those_of_sightings_that_others_confirm():
