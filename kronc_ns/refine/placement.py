@@ -17,7 +17,8 @@ from kronc_ns.refine.rig import Rig
 from kronc_ns.refine.tracks import Tracks, loose_views, place, view_medians, without, without_views
 
 _LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewhere
-_ACROSS_DEG, _RUN = 90.0, 0.25  # of views on the other side of the car than those before and after
+_ACROSS_DEG, _RUN = 90.0, 0.25  # of views on the other side of the car than those before and after ...
+_IN_ORDER_DEG = 45.0  # ... if photos are mostly as near as this to the next
 _RATIO, _SIMILAR = 0.8, 0.8  # of descriptors, as in guided matching but stricter
 _ASTRAY = 0.02  # of the focal length: median error of a view that no adjustment brought right
 _LEAST_OTHERS = 2  # views that a point must be seen in besides
@@ -52,7 +53,7 @@ def relocated(adjusted: Adjusted, gathered: Gathered, used: Bool[np.ndarray, "f"
 
 def seated(adjusted: Adjusted, tracks: Tracks, astray: Bool[np.ndarray, "n"]) -> tuple[Rig, Bool[np.ndarray, "n"]]:
     """The cameras, those that are ``astray`` or that no adjustment brought right where they see the points of all
-    others; and which of them found a place so.
+    others; and which of them see these, there or where they were.
 
     By ``tracks`` that owe nothing to the poses, those of these views among them.
     """
@@ -69,22 +70,28 @@ def seated(adjusted: Adjusted, tracks: Tracks, astray: Bool[np.ndarray, "n"]) ->
     rotation, translation, found = rig.rotation.copy(), rig.translation.copy(), np.zeros(count, bool)
     for view in np.flatnonzero(asked).tolist():
         own = (gathered.view[tracks.feature] == view) & known[tracks.of_track]
-        pose = _pose(points[row[tracks.of_track[own]]], uv[tracks.feature[own]], rig.focal)
-        if pose is not None:
+        seen, at = points[row[tracks.of_track[own]]], uv[tracks.feature[own]]
+        agree = _agreeing(seen, at, (rig.rotation[view], rig.translation[view]), rig.focal)
+        pose = _pose(seen, at, rig.focal)
+        if pose is not None and _agreeing(seen, at, pose, rig.focal) > _GAIN * agree + _MORE:
             rotation[view], translation[view] = pose
             found[view] = True
+        found[view] |= agree >= _LEAST_AGREEING
     return replace(rig, rotation=rotation, translation=translation), found
 
 
 def across(angles: Float[np.ndarray, "n n"]) -> Int[np.ndarray, "n"]:
     """Runs of views, numbered from 1 on (0: of none), that are seen from across the car while those before and after
     them in the order of the photos are not: front and rear, taken for each other. Where the walk is a lap the first
-    photo follows the last; where it is not, these are not near each other, and neither is of a run.
+    photo follows the last; where it is not, these are not near each other, and neither is of a run. Photos in no order
+    have none.
 
     ``angles`` are degrees between the directions from which views see the car.
     """
     count = len(angles)
     run, first = np.zeros(count, np.int64), np.arange(count)
+    if np.median(angles[first[:-1], first[1:]]) > _IN_ORDER_DEG:
+        return run
     for length in range(1, int(_RUN * count) + 1):
         before, after = first - 1, (first + length) % count
         inside = (first[:, None] + np.arange(length)) % count

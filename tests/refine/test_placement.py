@@ -228,6 +228,7 @@ def test_runs_across_the_car_are_told_from_laps_and_from_jumps():
     ends = 24.0 * np.arange(15)  # a whole lap: the first follows the last
     ends[[0, 14]] += 180
     assert across(between(ends)).tolist() == [1] + 13 * [0] + [1]
+    assert not across(between(np.random.default_rng(0).permutation(6.0 * np.arange(60)))).any()  # in no order
     half = 15.0 * np.arange(12)
     half[0] += 180
     assert not across(between(half)).any()
