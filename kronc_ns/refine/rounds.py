@@ -151,7 +151,10 @@ def _begun(prepared: Prepared, tracks: Tracks) -> Adjusted:
     drag these along: they join where they see the points of the others."""
     start, keypoints, gathered = prepared.start, prepared.keypoints, prepared.gathered
     astray = across(_angles(start)) > 0
-    begun = adjust(keypoints, without_views(tracks, gathered.view, astray), gathered, start, None)
+    believed = without_views(tracks, gathered.view, astray)
+    if not len(believed):
+        return adjust(keypoints, tracks, gathered, start, None)
+    begun = adjust(keypoints, believed, gathered, start, None)
     rig, found = seated(begun, tracks, astray)
     if not found.any():
         return begun
