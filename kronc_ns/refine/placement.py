@@ -62,15 +62,14 @@ def seated(adjusted: Adjusted, tracks: Tracks, astray: Bool[np.ndarray, "n"]) ->
     error = place(adjusted.tracks, uv, gathered.view, rig.cameras, _AGREES_PX)[1]
     medians = view_medians(adjusted.tracks, error, gathered.view, count)
     asked = astray | (medians > _ASTRAY * rig.focal)
-    believed = without_views(tracks, gathered.view, asked, _LEAST_OTHERS)
-    points = place(believed, uv, gathered.view, rig.cameras, _AGREES_PX)[0].points
     others = ~asked[gathered.view[tracks.feature]]
-    known = np.bincount(tracks.of_track[others], minlength=len(tracks)) >= _LEAST_OTHERS
-    row = np.cumsum(known) - 1  # of a track among those that are believed
+    known = tracks.chosen(np.bincount(tracks.of_track[others], minlength=len(tracks)) >= _LEAST_OTHERS)
+    believed = without_views(known, gathered.view, asked)
+    points = place(believed, uv, gathered.view, rig.cameras, _AGREES_PX)[0].points
     rotation, translation, found = rig.rotation.copy(), rig.translation.copy(), np.zeros(count, bool)
     for view in np.flatnonzero(asked).tolist():
-        own = (gathered.view[tracks.feature] == view) & known[tracks.of_track]
-        seen, at = points[row[tracks.of_track[own]]], uv[tracks.feature[own]]
+        own = gathered.view[known.feature] == view
+        seen, at = points[known.of_track[own]], uv[known.feature[own]]
         agree = _agreeing(seen, at, (rig.rotation[view], rig.translation[view]), rig.focal)
         pose = _pose(seen, at, rig.focal)
         if pose is not None and _agreeing(seen, at, pose, rig.focal) > _GAIN * agree + _MORE:

@@ -173,11 +173,11 @@ def of_held_views(tracks: Tracks, view: Int[np.ndarray, "f"], share: float) -> T
     return without_views(tracks, view, loose_views(tracks, view, int(view.max(initial=0)) + 1, share))
 
 
-def without_views(tracks: Tracks, view: Int[np.ndarray, "f"], out: Bool[np.ndarray, "n"], least: int = 2) -> Tracks:
-    """The tracks less the sightings of some views, where as many as ``least`` are left."""
+def without_views(tracks: Tracks, view: Int[np.ndarray, "f"], out: Bool[np.ndarray, "n"]) -> Tracks:
+    """The tracks less the sightings of some views, where two are left."""
     keep = ~out[view[tracks.feature]]
     left = rows_of(tracks.feature[keep], tracks.of_track[keep], tracks.points)
-    return left.chosen(left.lengths >= least)
+    return left.chosen(left.lengths >= 2)
 
 
 def place(
