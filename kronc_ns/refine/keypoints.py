@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, Int
 from kronc_ns.fit.noise import posterior
 from kronc_ns.fit.verdict import inliers
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import Tracks, place
+from kronc_ns.refine.tracks import Tracks
+from kronc_ns.refine.triangulation import place
 from kronc_ns.scene import Scene
 from kronc_ns.solution import Solution
 

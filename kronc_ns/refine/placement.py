@@ -14,7 +14,8 @@ from kronc_ns.refine.adjustment import Adjusted
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.pairs import view_angles
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import Tracks, loose_views, place, view_medians, without, without_views
+from kronc_ns.refine.tracks import Tracks, loose_views, view_medians, without, without_views
+from kronc_ns.refine.triangulation import place
 
 _LOOSE = 0.5  # of the usual sightings of a view: with fewer it may lie elsewhere
 _ACROSS_DEG, _RUN = 90.0, 0.25  # of views on the other side of the car than those before and after ...

@@ -26,10 +26,10 @@ from kronc_ns.refine.tracks import (
     enough,
     long_sightings,
     of_held_views,
-    place,
     without,
     without_views,
 )
+from kronc_ns.refine.triangulation import place
 from kronc_ns.refine.unguided import unguided_tracks
 from kronc_ns.refine.verdict import HELD_BY, MOST_LOOSE, Evidence, weigh
 from kronc_ns.scene import Scene

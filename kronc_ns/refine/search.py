@@ -14,17 +14,8 @@ from kronc_ns.refine.matching import Seen, match, standing_still
 from kronc_ns.refine.pairs import Bands, epipolar_bands, joint_covariance
 from kronc_ns.refine.region import compared_for_stillness, depth_range, still
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import (
-    HELD_SHARE,
-    LEAST_ANGLE_DEG,
-    Linked,
-    Tracks,
-    angles_deg,
-    link,
-    loose_views,
-    place,
-    pruned,
-)
+from kronc_ns.refine.tracks import HELD_SHARE, LEAST_ANGLE_DEG, Linked, Tracks, angles_deg, link, loose_views, pruned
+from kronc_ns.refine.triangulation import place
 from kronc_ns.solve.threads import side_by_side
 
 _BAND_SIGMAS = 3.0

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from kronc_ns.refine.gathering import Gathered
 from kronc_ns.refine.keypoints import MOST_ALIKE, POSE, KeypointTracks, chi_square
 from kronc_ns.refine.rig import Rig
-from kronc_ns.refine.tracks import Tracks, long_sightings, place
+from kronc_ns.refine.tracks import Tracks, long_sightings
+from kronc_ns.refine.triangulation import place
 
 _LEAST_Z = 3.0
 """Of the held-out tracks' test: chance alone passes it once in 700."""

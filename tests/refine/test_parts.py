@@ -12,17 +12,8 @@ from kronc_ns.refine.matching import Seen, match, standing_still
 from kronc_ns.refine.pairs import choose_pairs, view_angles
 from kronc_ns.refine.patches import _align
 from kronc_ns.refine.pictures import Picture
-from kronc_ns.refine.tracks import (
-    Cameras,
-    Linked,
-    angles_deg,
-    angles_off_middle_deg,
-    confirmed,
-    enough,
-    link,
-    place,
-    rows_of,
-)
+from kronc_ns.refine.tracks import Cameras, Linked, angles_deg, angles_off_middle_deg, confirmed, enough, link, rows_of
+from kronc_ns.refine.triangulation import place
 from kronc_ns.refine.verdict import _signed_rank_z
 
 FOCAL = 500.0
